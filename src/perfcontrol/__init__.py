@@ -1,0 +1,131 @@
+"""Performative control of linear dynamical systems: policies that change the system they control.
+
+Two policies are told apart everywhere: `M` is evaluated or improved, `deployed` is the one the world reacts to.
+"""
+
+from perfcontrol import experiments
+from perfcontrol._checks import InputError
+from perfcontrol.costs import AbstractCost, QuadraticCost
+from perfcontrol.evaluate import (
+    Estimate,
+    StateMoments,
+    Trajectories,
+    best_response,
+    estimate_cost,
+    expected_cost,
+    expected_cost_by_moments,
+    expected_gradient,
+    path_gradient,
+    recover_noise,
+    residual,
+    sample_gradient,
+    simulate,
+    state_moments,
+)
+from perfcontrol.perturbations import (
+    AbstractPerturbation,
+    DirectionalPerturbation,
+    NoPerturbation,
+    StockPerturbation,
+)
+from perfcontrol.policy import DisturbanceAction
+from perfcontrol.policy_maps import Affine, Function
+from perfcontrol.problem import PerformativeProblem
+from perfcontrol.random_vectors import (
+    AbstractRandomVector,
+    Constant,
+    Empirical,
+    Gaussian,
+    Linear,
+    Rademacher,
+    Sequence,
+    TruncatedGaussian,
+    Uniform,
+)
+from perfcontrol.sets import (
+    AbstractSet,
+    AbstractStructure,
+    FrobeniusBall,
+    FullStructure,
+    RepeatedBlock,
+    RowSimplex,
+    RowSum,
+    Unconstrained,
+)
+from perfcontrol.solvers import (
+    RRM,
+    RSGD,
+    AbstractSolver,
+    Exact,
+    Greedy,
+    InverseStep,
+    Lazy,
+    Pathwise,
+    Result,
+    Solution,
+    SolveError,
+    StablePoint,
+    solve,
+)
+from perfcontrol.systems import LinearSystem, design_gain
+
+__all__ = [
+    "RRM",
+    "RSGD",
+    "AbstractCost",
+    "AbstractPerturbation",
+    "AbstractRandomVector",
+    "AbstractSet",
+    "AbstractSolver",
+    "AbstractStructure",
+    "Affine",
+    "Constant",
+    "DirectionalPerturbation",
+    "DisturbanceAction",
+    "Empirical",
+    "Estimate",
+    "Exact",
+    "FrobeniusBall",
+    "FullStructure",
+    "Function",
+    "Gaussian",
+    "Greedy",
+    "InputError",
+    "InverseStep",
+    "Lazy",
+    "Linear",
+    "LinearSystem",
+    "NoPerturbation",
+    "Pathwise",
+    "PerformativeProblem",
+    "QuadraticCost",
+    "Rademacher",
+    "RepeatedBlock",
+    "Result",
+    "RowSimplex",
+    "RowSum",
+    "Sequence",
+    "Solution",
+    "SolveError",
+    "StablePoint",
+    "StateMoments",
+    "StockPerturbation",
+    "Trajectories",
+    "TruncatedGaussian",
+    "Unconstrained",
+    "Uniform",
+    "best_response",
+    "design_gain",
+    "estimate_cost",
+    "expected_cost",
+    "expected_cost_by_moments",
+    "expected_gradient",
+    "experiments",
+    "path_gradient",
+    "recover_noise",
+    "residual",
+    "sample_gradient",
+    "simulate",
+    "solve",
+    "state_moments",
+]

@@ -1,0 +1,175 @@
+"""Input checks with one wording of errors: the argument, what was got, what is required, the remedy."""
+
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.core
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+
+class InputError(ValueError):
+    """An argument is wrong; raised before any work starts."""
+
+
+_warned_about_precision = False
+
+
+def fail(name: str, got: str, required: str, remedy: str) -> InputError:
+    """The error that every check raises: "`name` must ...; got ... Remedy." """
+    return InputError(f"`{name}` must {required}; got {got}. {remedy}")
+
+
+def is_concrete(value: Any) -> bool:
+    """Whether values (not only shapes) can be looked at: False under jit, vmap and grad."""
+    return not isinstance(value, jax.core.Tracer)
+
+
+def as_array(name: str, value: Any) -> Array:
+    """`value` as a finite floating-point array of JAX's current default precision."""
+    global _warned_about_precision
+    if isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jnp.floating):
+        array = value
+    else:
+        try:
+            host = np.asarray(value)
+            if host.dtype == object or not (
+                np.issubdtype(host.dtype, np.number) or np.issubdtype(host.dtype, np.bool_)
+            ):
+                raise TypeError(f"dtype {host.dtype}")
+            if np.iscomplexobj(host):
+                raise TypeError("complex numbers")
+        except (TypeError, ValueError) as error:
+            if isinstance(value, jax.Array):  # an integer tracer: NumPy cannot read it, JAX can convert it
+                return jnp.asarray(value, dtype=float)
+            raise fail(
+                name,
+                f"{type(value).__name__} ({error})",
+                "be an array of real numbers",
+                "Pass a rectangular nested list, a NumPy array or a JAX array.",
+            ) from error
+        if host.dtype == np.float64 and not jax.config.jax_enable_x64 and not _warned_about_precision:  # type: ignore[attr-defined]
+            _warned_about_precision = True
+            if isinstance(value, np.ndarray):
+                warnings.warn(
+                    "float64 data arrived while JAX works in float32: it is rounded. For double precision call "
+                    'jax.config.update("jax_enable_x64", True) before anything else (said once).',
+                    stacklevel=3,
+                )
+        array = jnp.asarray(host, dtype=float)
+    if is_concrete(array) and not bool(jnp.all(jnp.isfinite(array))):
+        bad = np.argwhere(~np.isfinite(np.asarray(array)))[0].tolist()
+        raise fail(
+            name,
+            f"{np.asarray(array)[tuple(bad)]} at index {bad}",
+            "have finite entries only",
+            "Remove or impute missing values before building the problem.",
+        )
+    return array
+
+
+def check_shape(
+    name: str, array: Array, expected: Sequence[int], labels: Sequence[str], remedy: str = ""
+) -> None:
+    """Raise unless `array.shape == expected`; `labels` names the axes."""
+    expected = tuple(expected)
+    if tuple(array.shape) == expected:
+        return
+    axes = ", ".join(labels) + ("," if len(labels) == 1 else "")
+    hint = remedy or "Check the axis order: (sample, time, lag, input, state)."
+    if len(expected) >= 2 and array.shape == (*expected[:-2], expected[-1], expected[-2]):
+        hint = "The last two axes look swapped: pass its transpose."
+    raise fail(name, f"{tuple(array.shape)}", f"have shape ({axes}) = {expected}", hint)
+
+
+def check_time_varying(
+    name: str,
+    array: Array,
+    inner: Sequence[int],
+    labels: Sequence[str],
+    length: int,
+    length_label: str = "time",
+) -> None:
+    """Raise unless `array` has shape `inner` (constant) or `(length, *inner)`."""
+    inner = tuple(inner)
+    if array.ndim == len(inner) + 1:
+        check_shape(
+            name,
+            array,
+            (length, *inner),
+            (length_label, *labels),
+            f"A constant of shape {inner} is accepted too." if array.shape[1:] == inner else "",
+        )
+    else:
+        check_shape(name, array, inner, labels)
+
+
+def check_symmetric_psd(name: str, array: Array, remedy: str) -> None:
+    """Raise unless every matrix in the last two axes is symmetric positive semidefinite (to rounding)."""
+    if not is_concrete(array):
+        return
+    host = np.asarray(array, dtype=float)
+    scale = np.max(np.abs(host), initial=0.0)
+    slack = (
+        100 * float(np.finfo(np.asarray(array).dtype).eps) * max(scale, np.finfo(float).tiny) * host.shape[-1]
+    )
+    asymmetry = float(np.max(np.abs(host - np.swapaxes(host, -1, -2)), initial=0.0))
+    if asymmetry > slack:
+        raise fail(
+            name,
+            f"an asymmetry of {asymmetry:.3g}",
+            "be symmetric",
+            f"Pass ({name} + {name}.T) / 2.",
+        )
+    smallest = float(np.min(np.linalg.eigvalsh(host), initial=np.inf))
+    if smallest < -slack:
+        raise fail(name, f"smallest eigenvalue {smallest:.3g}", "be positive semidefinite", remedy)
+
+
+def check_integer(name: str, value: Any, minimum: int) -> int:
+    """`value` as a Python int of at least `minimum`."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer):
+        raise fail(name, repr(value), "be an integer", f"Pass a whole number of at least {minimum}.")
+    if value < minimum:
+        raise fail(name, str(value), f"be at least {minimum}", f"Pass a whole number of at least {minimum}.")
+    return int(value)
+
+
+def check_key(key: Any) -> Any:
+    """A JAX random key, typed or raw; there is no default."""
+    if key is None:
+        raise fail(
+            "key", "None", "be a JAX random key", "Pass key=jax.random.key(0): randomness is explicit here."
+        )
+    if isinstance(key, int | np.integer):
+        raise fail("key", repr(key), "be a JAX random key", f"Pass key=jax.random.key({key}).")
+    if not isinstance(key, jax.Array):
+        raise fail("key", type(key).__name__, "be a JAX random key", "Pass key=jax.random.key(0).")
+    return key
+
+
+def check_tolerance(tolerance: float | None, dtype: Any) -> float:
+    """The relative tolerance, 1e-11 in float64 and 1e-5 in float32 when None; raise if `dtype` cannot reach it."""
+    epsilon = float(jnp.finfo(dtype).eps)
+    double = epsilon < 1e-12
+    if tolerance is None:
+        return 1e-11 if double else 1e-5
+    if not (isinstance(tolerance, int | float | np.floating) and 0 < tolerance < np.inf):
+        raise fail("tolerance", repr(tolerance), "be a positive number", "Pass None for the default.")
+    floor = 20 * epsilon
+    if tolerance < floor:
+        remedy = (
+            "Pass tolerance=None for the default."
+            if double
+            else 'Pass a larger one, or call jax.config.update("jax_enable_x64", True) first.'
+        )
+        raise fail(
+            "tolerance",
+            f"{tolerance:.3g}",
+            f"be at least {floor:.1e}, what {jnp.dtype(dtype).name} can reach",
+            remedy,
+        )
+    return float(tolerance)

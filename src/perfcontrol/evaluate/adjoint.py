@@ -1,0 +1,107 @@
+"""The gradient of one path's cost by M, in linear time: forward states, backward adjoints.
+
+With y_t the adjoint of x_t and h_t = ∇_u c_t + B_tᵀ y_{t+1} (+ Δ's part on u):
+    y_t = ∇_x c_t - K_tᵀ ∇_u c_t + (A_t + Δ_t - B_t K_t)ᵀ y_{t+1},   ∇_{M[i-1]} J = Σ_t h_t w_{t-i}ᵀ.
+The same numbers as the paper's double sum (Appendix B, "grad M ct"), which costs O(T²); the terminal stage, which
+Algorithm 1 leaves out of its own objective, is included.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Key
+
+from perfcontrol._checks import check_integer, check_key
+from perfcontrol._linalg import along_time, rmatvec
+from perfcontrol.evaluate.rollout import BATCH, Path, Trajectories, check_pair, closed_loop, sample_path
+from perfcontrol.policy import feedforward_adjoint
+from perfcontrol.problem import PerformativeProblem
+
+
+def path_gradient(problem: PerformativeProblem, path: Path | Trajectories) -> Array:
+    """∇_M of the cost of an observed path, perturbations and noise held fixed.
+
+    Args:
+        path: states, inputs, noise and perturbation operators of one path (`Trajectories` with a sample axis give
+            the mean over samples).
+
+    Returns:
+        The gradient in the free parameters, shape `problem.policy_shape`.
+
+    References:
+        Appendix B, equation (grad M ct), with the window w_{t-1}, ..., w_{t-H}.
+    """
+    if isinstance(path, Trajectories):
+
+        def one(single: Trajectories) -> Array:
+            return path_gradient(problem, Path(single.x, single.u, single.w, single.draws))
+
+        return jnp.mean(jax.vmap(one)(path), axis=0)
+    system, gain = problem.system, problem.gain
+    n, m = problem.state_size, problem.input_size
+    acts_on_input = problem.perturbation.columns(n, m) > n
+    by_state, by_input = problem.cost.path_gradients(path.x, path.u)
+    gains = along_time(gain, 2, problem.horizon + 1)
+    source = by_state - (by_input @ gain if gain.ndim == 2 else jnp.einsum("tmn,tm->tn", gain, by_input))
+    loop = closed_loop(system, gain)
+    varying = loop.ndim == 3
+
+    def retreat(y: Array, step: Any) -> tuple[Array, tuple[Array, Array | None]]:
+        source_t, draw, loop_t, gain_t = step
+        reaction = path.draws.rmatvec_step(draw, y)
+        pulled = rmatvec(loop_t if varying else loop, y) + source_t
+        if acts_on_input:
+            return pulled + reaction[:n] - rmatvec(gain_t, reaction[n:]), (y, reaction[n:])
+        return pulled + reaction, (y, None)
+
+    steps = (source[:-1], path.draws.steps, loop if varying else None, gains[:-1] if acts_on_input else None)
+    _, (following, on_input) = jax.lax.scan(retreat, source[-1], steps, reverse=True)
+    by_v = following @ system.B if system.B.ndim == 2 else jnp.einsum("tnm,tn->tm", system.B, following)
+    if on_input is not None:
+        by_v = by_v + on_input
+    h = by_input.at[:-1].add(by_v)
+    return problem.structure.adjoint(feedforward_adjoint(h, path.w, problem.memory))
+
+
+def recover_noise(
+    problem: PerformativeProblem, x: Float[Array, "T1 n"], u: Float[Array, "T1 m"], A: Float[Array, "T n n"]
+) -> Float[Array, "T n"]:
+    """w_t = x_{t+1} - A_t x_t - B_t u_t from an observed path, A_t being the perturbed state matrix (Algorithm 1)."""
+    B = along_time(problem.system.B, 2, problem.horizon)
+    return x[1:] - jnp.einsum("tij,tj->ti", A, x[:-1]) - jnp.einsum("tij,tj->ti", B, u[:-1])
+
+
+def mean_path_gradient(
+    problem: PerformativeProblem, M: Array, deployed: Array, key: Key[Array, ""], samples: int
+) -> Array:
+    """Mean over `samples` paths of ∇_1 along each path; pure, for use inside compiled loops."""
+    policy, reacting = problem.structure.lift(M), problem.structure.lift(deployed)
+
+    def one(index: Array) -> Array:
+        path_key = key if samples == 1 else jax.random.fold_in(key, index)
+        return path_gradient(problem, sample_path(problem, policy, reacting, path_key))
+
+    if samples == 1:
+        return one(jnp.zeros((), int))
+    return jnp.mean(jax.lax.map(one, jnp.arange(samples), batch_size=min(BATCH, samples)), axis=0)
+
+
+_compiled_mean_path_gradient = eqx.filter_jit(mean_path_gradient)
+
+
+def sample_gradient(
+    problem: PerformativeProblem, M: Any, *, deployed: Any = None, key: Any = None, samples: int = 1
+) -> Array:
+    """Mean pathwise gradient ∇_1 C_T(M; deployed): unbiased, from simulated paths.
+
+    Returns:
+        Shape `problem.policy_shape`.
+
+    Raises:
+        InputError: wrong shapes, a missing key, samples < 1.
+    """
+    M, reacting = check_pair(problem, M, deployed)
+    samples = check_integer("samples", samples, 1)
+    return _compiled_mean_path_gradient(problem, M, reacting, check_key(key), samples)

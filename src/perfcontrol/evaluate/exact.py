@@ -1,0 +1,299 @@
+"""Exact cost and gradient of a policy for quadratic stage costs, without sampling: the cost-to-go form.
+
+The closed loop does not depend on M, so neither does the cost-to-go. Backward in time, on z = [x; u],
+
+    Γ_t = C_t + Ā_tᵀ Λ_{t+1} Ā_t + 𝒞_t*[Λ_{t+1}],     Ā_t = [A_t, B_t] + Θ_t,
+    [[Λ_t, D_tᵀ], [D_t, S_t]] = Γ_t seen through u = v - K_t x,
+
+where C_t is the stage weight, Θ_t = E Δ_t and 𝒞_t*[X] = E (Δ-Θ)ᵀX(Δ-Θ). An impulse w_s then costs a quadratic
+form in [I; M̂] with blocks S and D F⋯F B (`ImpulseForm`), the deterministic means cost what one mean path costs
+(`mean_path`), and the covariance of x_0 costs tr Λ_0 Cov(x_0). Nothing is quadratic in the horizon.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from perfcontrol._checks import fail
+from perfcontrol._linalg import along_time, matvec, rmatvec, symmetrise, transpose
+from perfcontrol.costs import QuadraticCost
+from perfcontrol.evaluate.rollout import check_pair
+from perfcontrol.policy import feedforward, feedforward_adjoint
+from perfcontrol.problem import PerformativeProblem
+
+
+class CostToGo(eqx.Module):
+    """What the deployed policy makes of the world; none of it depends on the evaluated policy.
+
+    Lambda: (T+1, n, n) cost-to-go. S: (T+1, m, m) curvature in the feedforward v_t. D: (T+1, m, n) its coupling to
+    the state. F: (T, n, n) mean closed loop. B: (T, n, m) mean input matrix, Θ included.
+    """
+
+    Lambda: Float[Array, "T1 n n"]
+    S: Float[Array, "T1 m m"]
+    D: Float[Array, "T1 m n"]
+    F: Float[Array, "T n n"]
+    B: Float[Array, "T n m"]
+
+
+class ImpulseForm(eqx.Module):
+    """Σ_s of the quadratic forms that impulses w_s meet, for noise whose covariance is constant.
+
+    G: (H m, H m), F: (H m, n), a: (n, n): cost tr Σ (a + FᵀM̂ + M̂ᵀF + M̂ᵀG M̂), M̂ the (H m, n) stack of lags.
+    """
+
+    G: Float[Array, "Hm Hm"]
+    F: Float[Array, "Hm n"]
+    a: Float[Array, "n n"]
+
+
+def require_moments(problem: PerformativeProblem) -> None:
+    """Raise unless cost and perturbation have what exact evaluation needs."""
+    remedy = "Use pc.estimate_cost and pc.sample_gradient, which only simulate."
+    if not isinstance(problem.cost, QuadraticCost):
+        raise fail("cost", type(problem.cost).__name__, "be a QuadraticCost for exact evaluation", remedy)
+    policy = jax.ShapeDtypeStruct(problem.lifted_shape, problem.dtype)
+    if (
+        eqx.filter_eval_shape(lambda p, M: p.covariance(M, problem.horizon), problem.perturbation, policy)
+        is None
+    ):
+        raise fail(
+            "perturbation",
+            f"{type(problem.perturbation).__name__} without known moments",
+            "know its mean and covariance for exact evaluation",
+            remedy,
+        )
+
+
+def mean_dynamics(problem: PerformativeProblem, reacting: Array) -> tuple[Array, Array]:
+    """[A_t, B_t] + Θ_t, (T, n, n+m), and the matrix [[I, 0], [-K_t, I]] from [x; v] to [x; u], (T+1, n+m, n+m)."""
+    n, m, T = problem.state_size, problem.input_size, problem.horizon
+    Theta = problem.perturbation.mean(reacting, T)
+    assert Theta is not None
+    joint = jnp.concatenate([along_time(problem.system.A, 2, T), along_time(problem.system.B, 2, T)], axis=-1)
+    joint = joint.at[..., : Theta.shape[-1]].add(Theta)
+    eye = jnp.eye(n + m, dtype=joint.dtype)
+    return joint, jnp.broadcast_to(eye, (T + 1, n + m, n + m)).at[:, n:, :n].set(-problem.gains())
+
+
+def cost_to_go(problem: PerformativeProblem, reacting: Array) -> CostToGo:
+    """The backward recursion under the lifted deployed policy `reacting`."""
+    n, T = problem.state_size, problem.horizon
+    weights = problem.cost.form(T).matrix  # type: ignore[attr-defined]
+    joint, through_gain = mean_dynamics(problem, reacting)
+    stage = transpose(through_gain) @ weights @ through_gain
+    closed = joint @ through_gain[:-1]  # [F_t, B_t]
+    F, B = closed[..., :n], closed[..., n:]
+    spread = problem.perturbation.covariance(reacting, T)
+    assert spread is not None
+    on_input = problem.perturbation.columns(n, problem.input_size) > n
+    state_part = through_gain[:-1, :, :n]
+
+    def retreat(Lambda: Array, step: Any) -> tuple[Array, Array]:
+        F_t, stage_t, spread_t, state_part_t = step
+        reaction = spread.adjoint_step(spread_t, Lambda)
+        if on_input:
+            reaction = state_part_t.T @ reaction @ state_part_t
+        previous = symmetrise(stage_t + F_t.T @ Lambda @ F_t + reaction)
+        return previous, previous
+
+    steps = (F, stage[:-1, :n, :n], spread.steps, state_part if on_input else None)
+    _, earlier = jax.lax.scan(retreat, stage[-1, :n, :n], steps, reverse=True)
+    Lambda = jnp.concatenate([earlier, stage[-1:, :n, :n]])
+    # What couples to v needs no recursion: in bulk over time.
+    pulled = transpose(B) @ Lambda[1:]
+    S = stage[:, n:, n:].at[:-1].add(symmetrise(pulled @ B))
+    D = stage[:, n:, :n].at[:-1].add(pulled @ F)
+    if on_input:
+        reaction = spread.adjoint(Lambda[1:])
+        S = S.at[:-1].add(reaction[:, n:, n:])
+        D = D.at[:-1].add(reaction[:, n:, :] @ state_part)
+    return CostToGo(Lambda, S, D, F, B)
+
+
+def _chains(world: CostToGo, memory: int) -> tuple[Array, Array]:
+    """Y[d]_t = D_t F_{t-1} ⋯ F_{t-d}, (H, T+1, m, n), and X[d]_t, the block coupling lags j and j-d at t = s+j.
+
+    X[0] = S and X[d] = Y[d-1]_t B_{t-d}, (H, T+1, m, m); zero where t < d.
+    """
+    T, n = world.F.shape[:2]
+
+    def shifted(array: Array, d: int) -> Array:
+        """array_{t-d} for t = 0..T, zero where t < d."""
+        pad = jnp.zeros((d, *array.shape[1:]), array.dtype)
+        return jnp.concatenate([pad, array])[: T + 1]
+
+    Y, X = [world.D], [world.S]
+    for d in range(1, memory):
+        X.append(Y[-1] @ shifted(world.B, d))
+        Y.append(Y[-1] @ shifted(world.F, d))
+    return jnp.stack(Y), jnp.stack(X)
+
+
+def impulse_form(world: CostToGo, memory: int) -> ImpulseForm:
+    """The blocks summed over impulses, by suffix sums over time."""
+    m, n = world.D.shape[1:]
+    Y, X = _chains(world, memory)
+    later = jnp.flip(jnp.cumsum(jnp.flip(X, axis=1), axis=1), axis=1)  # Σ_{t ≥ j} X[d]_t at index [d, j]
+    row, column = jnp.meshgrid(jnp.arange(memory), jnp.arange(memory), indexing="ij")
+    blocks = later[jnp.abs(row - column), jnp.maximum(row, column) + 1]
+    blocks = jnp.where((row >= column)[..., None, None], blocks, transpose(blocks))
+    G = blocks.transpose(0, 2, 1, 3).reshape(memory * m, memory * m)
+    F = jnp.sum(Y, axis=1)  # Y[d]_t is zero for t < d ...
+    F = F - Y[jnp.arange(memory), jnp.arange(memory)]  # ... and t = d would be the impulse w_{-1}
+    return ImpulseForm(G, F.reshape(memory * m, n), jnp.sum(world.Lambda[1:], axis=0))
+
+
+def _varying_impulses(world: CostToGo, M: Array, covariance: Array) -> tuple[Array, Array]:
+    """Cost and gradient (H, m, n) of the impulses where the noise covariance (T, n, n) varies in time."""
+    memory = M.shape[0]
+    T = covariance.shape[0]
+    Y, X = _chains(world, memory)
+
+    def spread(array: Array, j: int) -> Array:
+        """array_{s+j} for s = 0..T-1, zero past T."""
+        pad = jnp.zeros((memory, *array.shape[1:]), array.dtype)
+        return jnp.concatenate([array, pad])[j : j + T]
+
+    fed = [M[i] @ covariance for i in range(memory)]  # M_i Σ_s
+    linear = [jnp.einsum("tmn,tnk->mk", spread(Y[j - 1], j), covariance) for j in range(1, memory + 1)]
+    curved = [jnp.zeros_like(M[0]) for _ in range(memory)]
+    for j in range(1, memory + 1):
+        for d in range(j):
+            block = spread(X[d], j)
+            curved[j - 1] += jnp.einsum("tab,tbn->an", block, fed[j - 1 - d])
+            if d:
+                curved[j - 1 - d] += jnp.einsum("tba,tbn->an", block, fed[j - 1])
+    linear_all, curved_all = jnp.stack(linear), jnp.stack(curved)
+    constant = jnp.einsum("tij,tji->", world.Lambda[1:], covariance)
+    return constant + jnp.sum(M * (2 * linear_all + curved_all)), 2 * (linear_all + curved_all)
+
+
+def _constant_impulses(world: CostToGo, M: Array, covariance: Array) -> tuple[Array, Array]:
+    """Cost and gradient (H, m, n) of the impulses where the noise covariance (n, n) is constant."""
+    form = impulse_form(world, M.shape[0])
+    stacked = M.reshape(-1, M.shape[-1])
+    curved = form.G @ stacked
+    cost = jnp.sum(covariance * (form.a + transpose(stacked) @ (2 * form.F + curved)))
+    return cost, (2 * (form.F + curved) @ covariance).reshape(M.shape)
+
+
+def mean_path(
+    problem: PerformativeProblem, world: CostToGo, v: Array, w: Array, x0: Array, targets: bool = True
+) -> tuple[Array, Array]:
+    """Expected cost of the deterministic part v (T+1, m), w (T, n), x_0, and its gradient by v, (T+1, m).
+
+    The multiplicative noise that the mean path excites is included: Λ carries it.
+    """
+    n, T = problem.state_size, problem.horizon
+    form = problem.cost.form(T)  # type: ignore[attr-defined]
+    linear, constant = (form.linear, form.constant) if targets else (form.linear * 0, form.constant * 0)
+    gains = problem.gains()
+    moved = jnp.einsum("tij,tj->ti", world.Lambda[1:], w)  # Λ_{t+1} w_t
+    by_input_stage = linear[:, n:]
+    by_state_stage = linear[:, :n] - jnp.einsum("tmn,tm->tn", gains, by_input_stage)
+    source = by_state_stage + jnp.einsum("tmn,tm->tn", world.D, v)
+
+    def retreat(p: Array, step: Any) -> tuple[Array, Array]:
+        F_t, source_t, moved_t = step
+        return source_t + rmatvec(F_t, moved_t + p), p
+
+    p0, p_next = jax.lax.scan(retreat, source[-1], (world.F, source[:-1], moved), reverse=True)
+
+    def advance(mu: Array, step: Any) -> tuple[Array, Array]:
+        F_t, push_t = step
+        return matvec(F_t, mu) + push_t, mu
+
+    push = jnp.einsum("tnm,tm->tn", world.B, v[:-1]) + w
+    last, earlier = jax.lax.scan(advance, x0, (world.F, push))
+    mu = jnp.concatenate([earlier, last[None]])
+    Sv = jnp.einsum("tij,tj->ti", world.S, v)
+    half = by_input_stage.at[:-1].add(jnp.einsum("tnm,tn->tm", world.B, moved + p_next))
+    cost = jnp.sum(v * (Sv + 2 * half)) + jnp.sum(w * (moved + 2 * p_next)) + jnp.sum(constant)
+    cost = cost + x0 @ (world.Lambda[0] @ x0 + 2 * p0)
+    return cost, 2 * (jnp.einsum("tmn,tn->tm", world.D, mu) + Sv + half)
+
+
+def cost_and_gradient(problem: PerformativeProblem, world: CostToGo, policy: Array) -> tuple[Array, Array]:
+    """C_T and ∇_1 C_T at a lifted policy, given the world that the deployed policy makes."""
+    covariance, mean = problem.noise.covariance, problem.noise.mean
+    impulses = _constant_impulses if covariance.ndim == 2 else _varying_impulses
+    cost, gradient = impulses(world, policy, covariance)
+    w = along_time(mean, 1, problem.horizon)
+    deterministic, by_v = mean_path(problem, world, feedforward(policy, w), w, problem.initial_state.mean)
+    start = jnp.sum(world.Lambda[0] * problem.initial_state.covariance)
+    return cost + deterministic + start, gradient + feedforward_adjoint(by_v, w, problem.memory)
+
+
+def exact_cost(problem: PerformativeProblem, M: Array, deployed: Array) -> Array:
+    """C_T(M; deployed), free parameters; pure, differentiable in both."""
+    return cost_and_gradient(
+        problem, cost_to_go(problem, problem.structure.lift(deployed)), problem.structure.lift(M)
+    )[0]
+
+
+def exact_gradient(problem: PerformativeProblem, M: Array, deployed: Array) -> Array:
+    """∇_1 C_T(M; deployed) in the free parameters; pure, differentiable in both."""
+    world = cost_to_go(problem, problem.structure.lift(deployed))
+    return problem.structure.adjoint(cost_and_gradient(problem, world, problem.structure.lift(M))[1])
+
+
+_compiled_cost = eqx.filter_jit(exact_cost)
+_compiled_gradient = eqx.filter_jit(exact_gradient)
+
+
+@eqx.filter_jit
+def _total_gradient(problem: PerformativeProblem, M: Array) -> Array:
+    return jax.grad(lambda policy: exact_cost(problem, policy, policy))(M)
+
+
+def expected_cost(problem: PerformativeProblem, M: Any, *, deployed: Any = None) -> Array:
+    """Exact C_T(M; deployed) = E Σ_{t=0..T} c_t(x_t, u_t); `deployed=None` means M: the performative cost.
+
+    Beware: `jax.grad(lambda M: expected_cost(problem, M))` differentiates in both policies, which is the gradient
+    of the performative optimum, not the one that performative stability is about. See `expected_gradient`.
+
+    Args:
+        problem: with a QuadraticCost and a perturbation of known moments.
+        M, deployed: free policy parameters, `problem.policy_shape`.
+
+    Returns:
+        A scalar.
+
+    Raises:
+        InputError: wrong shapes, a cost or perturbation without closed moments.
+    """
+    M, reacting = check_pair(problem, M, deployed)
+    require_moments(problem)
+    return _compiled_cost(problem, M, reacting)
+
+
+def expected_gradient(
+    problem: PerformativeProblem, M: Any, *, deployed: Any = None, total: bool = False
+) -> Array:
+    """Exact ∇_1 C_T(M; deployed), the first argument alone; `total=True`: the derivative of C_T(M; M).
+
+    A performatively stable policy has ∇_1 C_T(M; M) = 0 (or satisfies the variational inequality on the feasible
+    set); a performatively optimal one has a zero total gradient.
+
+    Returns:
+        Shape `problem.policy_shape`.
+
+    Raises:
+        InputError: as `expected_cost`; `total=True` together with another deployed policy.
+    """
+    M, reacting = check_pair(problem, M, deployed)
+    require_moments(problem)
+    if not total:
+        return _compiled_gradient(problem, M, reacting)
+    if deployed is not None:
+        raise fail(
+            "deployed",
+            "a policy together with total=True",
+            "be left out for the total gradient",
+            "The total derivative moves both policies together.",
+        )
+    return _total_gradient(problem, M)

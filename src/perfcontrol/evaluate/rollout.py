@@ -1,0 +1,166 @@
+"""Simulation: closed-loop paths of a policy while another, or the same, is deployed.
+
+The time loop holds one matrix-vector product, one perturbation product and an addition; everything that does not
+depend on the state is computed in bulk around it.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Key
+
+from perfcontrol._checks import check_integer, check_key
+from perfcontrol._linalg import along_time, matvec
+from perfcontrol.perturbations import Draws
+from perfcontrol.policy import feedforward
+from perfcontrol.problem import PerformativeProblem
+
+BATCH = 8  # paths worked on together: they stay in cache, twice as fast as all at once
+
+
+class Path(eqx.Module):
+    """One closed-loop path: x (T+1, n), u (T+1, m), w (T, n) and the perturbations drawn."""
+
+    x: Float[Array, "T1 n"]
+    u: Float[Array, "T1 m"]
+    w: Float[Array, "T n"]
+    draws: Draws
+
+
+class Trajectories(eqx.Module):
+    """Simulated paths.
+
+    x: (samples, T+1, n) states. u: (samples, T+1, m) inputs. w: (samples, T, n) noise.
+    cost: (samples,) summed over the T+1 stages. draws: the perturbations, every leaf with a leading sample axis.
+    """
+
+    x: Float[Array, "S T1 n"]
+    u: Float[Array, "S T1 m"]
+    w: Float[Array, "S T n"]
+    cost: Float[Array, " S"]
+    draws: Draws
+
+
+class Estimate(eqx.Module):
+    """A sample mean with its standard error."""
+
+    mean: Float[Array, "..."]
+    standard_error: Float[Array, "..."]
+
+
+def closed_loop(system: Any, gain: Array) -> Array:
+    """A - B K, constant if all three are, else (T, n, n)."""
+    if gain.ndim == 3:
+        gain = gain[:-1]
+    return system.A - system.B @ gain
+
+
+def input_term(B: Array, v: Float[Array, "T1 m"]) -> Float[Array, "T n"]:
+    """B_t v_t for t = 0..T-1."""
+    return v[:-1] @ B.T if B.ndim == 2 else jnp.einsum("tnm,tm->tn", B, v[:-1])
+
+
+def feedback(gain: Array, x: Float[Array, "T1 n"]) -> Float[Array, "T1 m"]:
+    """K_t x_t for t = 0..T."""
+    return x @ gain.T if gain.ndim == 2 else jnp.einsum("tmn,tn->tm", gain, x)
+
+
+def sample_path(problem: PerformativeProblem, policy: Array, deployed: Array, key: Key[Array, ""]) -> Path:
+    """One path; `policy` and `deployed` are lifted."""
+    initial_key, noise_key, perturbation_key = jax.random.split(key, 3)
+    x0 = problem.initial_state.sample(initial_key, 1)[0].astype(policy.dtype)
+    w = problem.noise.sample(noise_key, problem.horizon).astype(policy.dtype)
+    draws = problem.perturbation.sample(perturbation_key, deployed, problem.horizon)
+    return run_path(problem, policy, x0, w, draws)
+
+
+def run_path(problem: PerformativeProblem, policy: Array, x0: Array, w: Array, draws: Draws) -> Path:
+    """The path of given noise and perturbations; `policy` is lifted."""
+    system, gain = problem.system, problem.gain
+    n, m = problem.state_size, problem.input_size
+    acts_on_input = problem.perturbation.columns(n, m) > n
+    v = feedforward(policy, w)
+    offset = input_term(system.B, v) + w
+    loop = closed_loop(system, gain)
+    varying = loop.ndim == 3
+
+    def advance(x: Array, step: Any) -> tuple[Array, Array]:
+        offset_t, draw, loop_t, u_part = step
+        z = x
+        if acts_on_input:
+            v_t, gain_t = u_part
+            z = jnp.concatenate([x, v_t - matvec(gain_t, x)])
+        following = matvec(loop_t if varying else loop, x) + draws.matvec_step(draw, z) + offset_t
+        return following, following
+
+    u_part = (v[:-1], along_time(gain, 2, problem.horizon + 1)[:-1]) if acts_on_input else None
+    _, states = jax.lax.scan(advance, x0, (offset, draws.steps, loop if varying else None, u_part))
+    x = jnp.concatenate([x0[None], states])
+    return Path(x, v - feedback(gain, x), w, draws)
+
+
+@eqx.filter_jit
+def _simulate(
+    problem: PerformativeProblem, M: Array, deployed: Array, key: Array, samples: int
+) -> Trajectories:
+    policy, reacting = problem.structure.lift(M), problem.structure.lift(deployed)
+
+    def one(index: Array) -> Trajectories:
+        path = sample_path(problem, policy, reacting, jax.random.fold_in(key, index))
+        return Trajectories(
+            path.x, path.u, path.w, jnp.sum(problem.cost.path_cost(path.x, path.u)), path.draws
+        )
+
+    return jax.lax.map(one, jnp.arange(samples), batch_size=min(BATCH, samples))
+
+
+@eqx.filter_jit
+def _path_costs(problem: PerformativeProblem, M: Array, deployed: Array, key: Array, samples: int) -> Array:
+    policy, reacting = problem.structure.lift(M), problem.structure.lift(deployed)
+
+    def one(index: Array) -> Array:
+        path = sample_path(problem, policy, reacting, jax.random.fold_in(key, index))
+        return jnp.sum(problem.cost.path_cost(path.x, path.u))
+
+    return jax.lax.map(one, jnp.arange(samples), batch_size=min(BATCH, samples))
+
+
+def check_pair(problem: PerformativeProblem, M: Any, deployed: Any) -> tuple[Array, Array]:
+    """Both policies as arrays; `deployed=None` means M."""
+    M = problem.check_policy("M", M)
+    return M, M if deployed is None else problem.check_policy("deployed", deployed)
+
+
+def simulate(
+    problem: PerformativeProblem, M: Any, *, deployed: Any = None, key: Any = None, samples: int = 1
+) -> Trajectories:
+    """Independent closed-loop paths of the policy M while the world reacts to `deployed` (None: to M itself).
+
+    Sample s uses `fold_in(key, s)`: the first samples stay the same when more are asked for.
+
+    Args:
+        M: free policy parameters, `problem.policy_shape`.
+        deployed: likewise.
+        key: JAX random key; required.
+        samples: number of paths.
+
+    Raises:
+        InputError: wrong shapes, a missing key, samples < 1.
+    """
+    M, reacting = check_pair(problem, M, deployed)
+    return _simulate(problem, M, reacting, check_key(key), check_integer("samples", samples, 1))
+
+
+def estimate_cost(
+    problem: PerformativeProblem, M: Any, *, deployed: Any = None, key: Any = None, samples: int = 1024
+) -> Estimate:
+    """Monte Carlo estimate of C_T(M; deployed) with its standard error; needs no moments and any cost.
+
+    Raises:
+        InputError: as `simulate`; at least two samples are needed for a standard error.
+    """
+    M, reacting = check_pair(problem, M, deployed)
+    costs = _path_costs(problem, M, reacting, check_key(key), check_integer("samples", samples, 2))
+    return Estimate(jnp.mean(costs), jnp.std(costs, ddof=1) / jnp.sqrt(samples))

@@ -1,0 +1,5 @@
+"""Ready problems and the reproduction of the paper's experiment (imported on demand)."""
+
+from perfcontrol.experiments.stock import stock_market, stock_sensitivities
+
+__all__ = ["stock_market", "stock_sensitivities"]

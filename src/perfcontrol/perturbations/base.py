@@ -1,0 +1,111 @@
+"""The interface of a perturbation law D_t(M), and the two kinds of operators that it hands out.
+
+Operators keep what varies in time (`steps`, a pytree with leading axis T) apart from what does not, so that a
+time loop carries only the former: loops call `*_step(step, ...)`, bulk code the methods without suffix.
+"""
+
+import abc
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Key
+
+
+class Draws(eqx.Module):
+    """One draw of Δ_0, ..., Δ_{T-1} as linear operators from R^p to R^n, p = n, or n+m for performative B."""
+
+    @property
+    @abc.abstractmethod
+    def steps(self) -> Any:
+        """What varies in time, a pytree with leading axis T."""
+
+    @abc.abstractmethod
+    def matvec_step(self, step: Any, z: Float[Array, " p"]) -> Float[Array, " n"]:
+        """Δ_t z."""
+
+    @abc.abstractmethod
+    def rmatvec_step(self, step: Any, y: Float[Array, " n"]) -> Float[Array, " p"]:
+        """Δ_tᵀ y."""
+
+    @abc.abstractmethod
+    def dense(self) -> Float[Array, "T n p"]:
+        """The matrices."""
+
+    def matvec(self, z: Float[Array, "T p"]) -> Float[Array, "T n"]:
+        """Δ_t z_t for every t."""
+        return jax.vmap(self.matvec_step)(self.steps, z)
+
+    def rmatvec(self, y: Float[Array, "T n"]) -> Float[Array, "T p"]:
+        """Δ_tᵀ y_t for every t."""
+        return jax.vmap(self.rmatvec_step)(self.steps, y)
+
+
+class CovarianceOperator(eqx.Module):
+    """X -> E[(Δ_t - EΔ_t) X (Δ_t - EΔ_t)ᵀ] and its adjoint X -> E[(Δ_t - EΔ_t)ᵀ X (Δ_t - EΔ_t)]."""
+
+    @property
+    @abc.abstractmethod
+    def steps(self) -> Any:
+        """What varies in time, a pytree with leading axis T."""
+
+    @abc.abstractmethod
+    def apply_step(self, step: Any, X: Float[Array, "p p"]) -> Float[Array, "n n"]:
+        """E[(Δ-Θ) X (Δ-Θ)ᵀ] at one time."""
+
+    @abc.abstractmethod
+    def adjoint_step(self, step: Any, X: Float[Array, "n n"]) -> Float[Array, "p p"]:
+        """E[(Δ-Θ)ᵀ X (Δ-Θ)] at one time."""
+
+    def apply(self, X: Array) -> Float[Array, "T n n"]:
+        """`apply_step` for every t, X of shape (p, p) or (T, p, p)."""
+        return jax.vmap(self.apply_step, in_axes=(0, 0 if X.ndim == 3 else None))(self.steps, X)
+
+    def adjoint(self, X: Array) -> Float[Array, "T p p"]:
+        """`adjoint_step` for every t, X of shape (n, n) or (T, n, n)."""
+        return jax.vmap(self.adjoint_step, in_axes=(0, 0 if X.ndim == 3 else None))(self.steps, X)
+
+
+class AbstractPerturbation(eqx.Module):
+    """A law D_t(M) of the perturbation Δ_t, independent over time; M is the lifted policy (memory, input, state).
+
+    `mean`, `covariance`, `bound` and `sensitivity` may return None for "unknown": then the exact engine, or the
+    certificates that need them, say so.
+    """
+
+    @abc.abstractmethod
+    def sample(self, key: Key[Array, ""], M: Array, horizon: int) -> Draws:
+        """One draw of Δ_0..Δ_{T-1} under the deployed policy M."""
+
+    @abc.abstractmethod
+    def mean(self, M: Array, horizon: int) -> Float[Array, "T n p"] | None:
+        """Θ_t(M) = E Δ_t."""
+
+    @abc.abstractmethod
+    def covariance(self, M: Array, horizon: int) -> CovarianceOperator | None:
+        """The covariance operator of Δ_t under M."""
+
+    @abc.abstractmethod
+    def bound(self, feasible_set: Any, horizon: int) -> Float[Array, " T"] | None:
+        """ξ_t ≥ ‖Δ_t‖ (spectral norm) almost surely for every policy of the set."""
+
+    @abc.abstractmethod
+    def sensitivity(self, feasible_set: Any, horizon: int) -> Float[Array, " T"] | None:
+        """ε_t ≥ W₁(D_t(M), D_t(M')) / ‖M - M'‖_F over the set, spectral norm as ground metric."""
+
+    def columns(self, state_size: int, input_size: int) -> int:
+        """p: n if Δ acts on the state alone, n+m if on [x; u]."""
+        return state_size
+
+    def check(self, policy_shape: tuple[int, int, int], horizon: int) -> None:
+        """Raise InputError where this law does not fit a problem of that shape; looks at shapes only."""
+
+    def policy_free_mean(self) -> bool:
+        """Whether E Δ_t is known not to depend on the policy."""
+        return False
+
+
+def zero_mean(M: Array, horizon: int, columns: int) -> Array:
+    """Θ_t = 0."""
+    return jnp.zeros((horizon, M.shape[-1], columns), M.dtype)

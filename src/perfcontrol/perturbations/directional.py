@@ -1,0 +1,203 @@
+"""Random multiples of fixed directions: Δ_t = mean(M)[t] + Σ_k scale(M)[t, k] ζ_{t,k} directions[k]."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Key
+
+from perfcontrol._checks import as_array, fail
+from perfcontrol._linalg import matvec, rmatvec
+from perfcontrol.perturbations.base import AbstractPerturbation, CovarianceOperator, Draws, zero_mean
+from perfcontrol.perturbations.scalar_laws import SCALAR_LAWS
+from perfcontrol.policy_maps import AbstractPolicyMap, Affine, as_policy_map, evaluate_map
+
+
+class _DirectionalDraws(Draws):
+    mean: Array | None  # (T, n, p)
+    coefficients: Array  # (T, k)
+    directions: Array  # (k, n, p)
+
+    @property
+    def steps(self) -> Any:
+        return self.mean, self.coefficients
+
+    def matvec_step(self, step: Any, z: Array) -> Array:
+        mean, coefficients = step
+        product = coefficients @ matvec(self.directions, z)
+        return product if mean is None else product + matvec(mean, z)
+
+    def rmatvec_step(self, step: Any, y: Array) -> Array:
+        mean, coefficients = step
+        product = coefficients @ rmatvec(self.directions, y)
+        return product if mean is None else product + rmatvec(mean, y)
+
+    def dense(self) -> Array:
+        matrices = jnp.einsum("tk,knp->tnp", self.coefficients, self.directions)
+        return matrices if self.mean is None else matrices + self.mean
+
+
+class _DirectionalCovariance(CovarianceOperator):
+    variances: Array  # (T, k)
+    directions: Array  # (k, n, p)
+
+    @property
+    def steps(self) -> Any:
+        return self.variances
+
+    def apply_step(self, step: Any, X: Array) -> Array:
+        return jnp.einsum("k,kab,bc,kdc->ad", step, self.directions, X, self.directions, optimize="optimal")
+
+    def adjoint_step(self, step: Any, X: Array) -> Array:
+        return jnp.einsum("k,kba,bc,kcd->ad", step, self.directions, X, self.directions, optimize="optimal")
+
+
+class DirectionalPerturbation(AbstractPerturbation):
+    """Fixed directions with random coefficients whose size depends on the policy.
+
+    Δ_t = mean(M)[t] + Σ_k scale(M)[t, k] ζ_{t,k} directions[k], ζ independent, of zero mean and unit variance.
+
+    Args:
+        directions: (k, n, n), or (k, n, n+m) to act on [x; u] (performative B).
+        scale: policy map, callable or array with values (T, k) or (k,).
+        mean: policy map, callable or array with values (T, n, p) or (n, p); None is zero.
+        law: of ζ: "rademacher", "uniform" or "truncated_gaussian" (cut at three standard deviations).
+
+    Raises:
+        InputError: unknown law, or shapes that do not fit (when the problem is built).
+    """
+
+    directions: Array
+    scale: AbstractPolicyMap | Array
+    mean_map: AbstractPolicyMap | Array | None
+    law: str = eqx.field(static=True)
+
+    def __init__(self, directions: Any, scale: Any, mean: Any = None, law: str = "rademacher"):
+        self.directions = as_array("directions", directions)
+        if self.directions.ndim != 3:
+            raise fail(
+                "directions",
+                f"{self.directions.shape}",
+                "have shape (k, n, n) or (k, n, n+m)",
+                "A single direction D is passed as [D].",
+            )
+        if law not in SCALAR_LAWS:
+            raise fail("law", repr(law), f"be one of {sorted(SCALAR_LAWS)}", "Pass one of these names.")
+        self.scale = as_policy_map("scale", scale)
+        self.mean_map = None if mean is None else as_policy_map("mean", mean)
+        self.law = law
+
+    def columns(self, state_size: int, input_size: int) -> int:
+        return self.directions.shape[-1]
+
+    def check(self, policy_shape: tuple[int, int, int], horizon: int) -> None:
+        _, m, n = policy_shape
+        count, rows, columns = self.directions.shape
+        if rows != n or columns not in (n, n + m):
+            raise fail(
+                "directions",
+                f"{self.directions.shape}",
+                f"have shape (k, n, n) = ({count}, {n}, {n}) or (k, n, n+m) = ({count}, {n}, {n + m})",
+                "n and m come from the system.",
+            )
+        policy = jax.ShapeDtypeStruct(policy_shape, self.directions.dtype)
+        allowed = {"scale": [(horizon, count), (count,)], "mean": [(horizon, n, columns), (n, columns)]}
+        for name, policy_map in (("scale", self.scale), ("mean", self.mean_map)):
+            if policy_map is None:
+                continue
+            try:
+                shape = jax.eval_shape(evaluate_map, policy_map, policy).shape
+            except (TypeError, ValueError) as error:
+                raise fail(
+                    name,
+                    f"an error from the policy map ({error})",
+                    f"accept a policy of shape {policy_shape}",
+                    "Policy maps receive the lifted policy (memory, input, state).",
+                ) from error
+            if shape not in allowed[name]:
+                raise fail(
+                    name,
+                    f"values of shape {shape}",
+                    f"have values of shape {allowed[name][0]} or {allowed[name][1]}",
+                    "The time axis comes first.",
+                )
+
+    def scales(self, M: Array, horizon: int) -> Array:
+        """scale(M), shape (T, k)."""
+        return jnp.broadcast_to(evaluate_map(self.scale, M), (horizon, self.directions.shape[0]))
+
+    def sample(self, key: Key[Array, ""], M: Array, horizon: int) -> Draws:
+        scales = self.scales(M, horizon)
+        signs = SCALAR_LAWS[self.law].sample(key, scales.shape, scales.dtype)
+        mean = None if self.mean_map is None else self.mean(M, horizon)
+        return _DirectionalDraws(mean, scales * signs, self.directions)
+
+    def mean(self, M: Array, horizon: int) -> Array:
+        if self.mean_map is None:
+            return zero_mean(M, horizon, self.directions.shape[-1])
+        return jnp.broadcast_to(evaluate_map(self.mean_map, M), (horizon, *self.directions.shape[1:]))
+
+    def covariance(self, M: Array, horizon: int) -> CovarianceOperator:
+        return _DirectionalCovariance(self.scales(M, horizon) ** 2, self.directions)
+
+    def policy_free_mean(self) -> bool:
+        return not isinstance(self.mean_map, AbstractPolicyMap)
+
+    def bound(self, feasible_set: Any, horizon: int) -> Array | None:
+        """Σ_k sup|scale_k| sup|ζ| ‖D_k‖ + sup‖mean‖; known for affine maps on a bounded set."""
+        scales = _largest_entries(self.scale, feasible_set)
+        if scales is None:
+            return None
+        norms = jnp.linalg.norm(self.directions, ord=2, axis=(-2, -1))
+        total = SCALAR_LAWS[self.law].bound * jnp.sum(scales * norms, axis=-1)
+        if self.mean_map is not None:
+            means = _largest_entries(self.mean_map, feasible_set)
+            if means is None:
+                return None
+            constant = not isinstance(self.mean_map, AbstractPolicyMap)
+            order = 2 if constant else "fro"  # entrywise suprema: only the Frobenius norm is monotone in them
+            total = total + jnp.linalg.norm(means, ord=order, axis=(-2, -1))
+        return jnp.broadcast_to(total, (horizon,))
+
+    def sensitivity(self, feasible_set: Any, horizon: int) -> Array | None:
+        """Σ_k ‖slope_k‖_F E|ζ| ‖D_k‖ + ‖mean slope‖: couples both laws by the same ζ; known for affine maps."""
+        slopes = _slopes(self.scale)
+        if slopes is None:
+            return None
+        norms = jnp.linalg.norm(self.directions, ord=2, axis=(-2, -1))
+        per_direction = (
+            jnp.sqrt(jnp.sum(slopes**2, axis=(-3, -2, -1))) * norms if slopes.ndim else jnp.zeros_like(norms)
+        )
+        total = SCALAR_LAWS[self.law].mean_absolute * jnp.sum(per_direction, axis=-1)
+        if isinstance(self.mean_map, AbstractPolicyMap):
+            mean_slopes = _slopes(self.mean_map)
+            if mean_slopes is None:
+                return None
+            flat = mean_slopes.reshape(*mean_slopes.shape[:-5], -1, *mean_slopes.shape[-3:])
+            total = total + jnp.linalg.norm(flat.reshape(*flat.shape[:-3], -1), ord=2, axis=(-2, -1))
+        return jnp.broadcast_to(total, (horizon,))
+
+
+def _largest_entries(policy_map: AbstractPolicyMap | Array, feasible_set: Any) -> Array | None:
+    """sup over the set of |entries|; None where not known (a general function, an unbounded set)."""
+    if not isinstance(policy_map, AbstractPolicyMap):
+        return jnp.abs(policy_map)
+    if not isinstance(policy_map, Affine):
+        return None
+    flat = policy_map.slope.reshape(-1, *policy_map.slope.shape[-3:])
+    upper = feasible_set.support(flat)
+    lower = feasible_set.support(-flat)
+    if upper is None or lower is None:
+        return None
+    shape = policy_map.offset.shape
+    return jnp.maximum(
+        jnp.abs(policy_map.offset + upper.reshape(shape)), jnp.abs(policy_map.offset - lower.reshape(shape))
+    )
+
+
+def _slopes(policy_map: AbstractPolicyMap | Array) -> Array | None:
+    """The derivative of an affine map, a zero scalar for a constant, None for a general function."""
+    if not isinstance(policy_map, AbstractPolicyMap):
+        return jnp.zeros(())
+    return policy_map.slope if isinstance(policy_map, Affine) else None

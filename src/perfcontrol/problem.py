@@ -1,0 +1,216 @@
+"""The performative control problem: everything that the world is, checked together once."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.core
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from perfcontrol._checks import as_array, check_integer, check_shape, check_time_varying, fail
+from perfcontrol._linalg import along_time
+from perfcontrol.costs import AbstractCost
+from perfcontrol.perturbations import AbstractPerturbation, NoPerturbation
+from perfcontrol.random_vectors import AbstractRandomVector, Constant, Sequence
+from perfcontrol.sets import AbstractSet, AbstractStructure, FullStructure, LiftedSet, Unconstrained
+from perfcontrol.systems import LinearSystem
+
+
+class PerformativeProblem(eqx.Module):
+    """A linear system whose perturbations react to the deployed disturbance-action policy.
+
+    x_{t+1} = A_t x_t + B_t u_t + Δ_t z_t + w_t for t = 0..T-1, Δ_t ~ D_t(deployed policy), z = x (or [x; u]);
+    u_t = -K_t x_t + Σ_{i=1..memory} M[i-1] w_{t-i};  C_T(M; M') = E Σ_{t=0..T} c_t(x_t, u_t).
+
+    Args:
+        system: A_t and B_t.
+        horizon: T ≥ 1; stages t = 0..T are summed, the terminal one included.
+        noise: law of w_t, dimension n.
+        cost: the stage cost.
+        memory: H, 1 ≤ H < T.
+        gain: K, (m, n) or (T+1, m, n); 0 for none. Sign: u = -K x.
+        perturbation: the law D_t(M).
+        feasible_set: of the free policy parameters.
+        initial_state: law of x_0, or a vector (n,), or 0.
+        structure: linear map from free parameters to the full policy.
+
+    Raises:
+        InputError: anything that does not fit, before any work.
+
+    A policy passed to the package's functions is the free parameters, shape `policy_shape`: (memory, m, n) unless
+    structured. `lift` gives the full policy, which perturbations and policy maps receive.
+    """
+
+    system: LinearSystem
+    noise: AbstractRandomVector
+    cost: AbstractCost
+    gain: Array
+    perturbation: AbstractPerturbation
+    feasible_set: AbstractSet
+    initial_state: AbstractRandomVector
+    structure: AbstractStructure
+    horizon: int = eqx.field(static=True)
+    memory: int = eqx.field(static=True)
+
+    def __init__(
+        self,
+        *,
+        system: LinearSystem,
+        horizon: int,
+        noise: AbstractRandomVector,
+        cost: AbstractCost,
+        memory: int = 1,
+        gain: Any = 0,
+        perturbation: AbstractPerturbation | None = None,
+        feasible_set: AbstractSet | None = None,
+        initial_state: Any = 0,
+        structure: AbstractStructure | None = None,
+    ):
+        self.system = _instance("system", system, LinearSystem, "Build it with pc.LinearSystem(A, B).")
+        self.cost = _instance("cost", cost, AbstractCost, "Build it with pc.QuadraticCost(Q, R).")
+        self.perturbation = _instance(
+            "perturbation",
+            perturbation or NoPerturbation(),
+            AbstractPerturbation,
+            "Subclass AbstractPerturbation.",
+        )
+        self.feasible_set = _instance(
+            "feasible_set",
+            feasible_set or Unconstrained(),
+            AbstractSet,
+            "Pass for example pc.FrobeniusBall(1.0).",
+        )
+        self.structure = _instance(
+            "structure",
+            structure or FullStructure(),
+            AbstractStructure,
+            "Pass for example pc.RepeatedBlock(2).",
+        )
+        n, m = system.state_size, system.input_size
+        self.horizon = check_integer("horizon", horizon, 1)
+        self.memory = check_integer("memory", memory, 1)
+        if self.memory >= self.horizon:
+            raise fail(
+                "memory",
+                str(self.memory),
+                f"be below the horizon {self.horizon}",
+                "Shorten the memory or lengthen the horizon.",
+            )
+        if system.horizon not in (None, self.horizon):
+            raise fail(
+                "horizon",
+                str(self.horizon),
+                f"match the {system.horizon} time steps of the system",
+                "A_t and B_t are given for t = 0..horizon-1.",
+            )
+        self.noise = self._law("noise", noise, n)
+        if isinstance(initial_state, Sequence):
+            raise fail(
+                "initial_state", "a Sequence", "be one random vector", "Pass an array (n,) or another law."
+            )
+        self.initial_state = self._law(
+            "initial_state",
+            initial_state if isinstance(initial_state, AbstractRandomVector) else Constant(initial_state),
+            n,
+        )
+        gain_array = as_array("gain", gain)
+        if gain_array.ndim == 0:
+            gain_array = jnp.broadcast_to(gain_array, (m, n)) if m == n == 1 else _zero_gain(gain_array, m, n)
+        check_time_varying("gain", gain_array, (m, n), ("m", "n"), self.horizon + 1, "T+1")
+        self.gain = gain_array
+        self.cost.check(n, m, self.horizon)
+        self.perturbation.check(self.lifted_shape, self.horizon)
+        self.feasible_set.check(self.policy_shape)
+
+    def _law(self, name: str, law: Any, size: int) -> AbstractRandomVector:
+        law = _instance(name, law, AbstractRandomVector, "Pass for example pc.Gaussian(mean, covariance).")
+        law = law.resize(size)
+        if law.size != size:
+            raise fail(name, f"dimension {law.size}", f"have dimension n = {size}", "One entry per state.")
+        if law.mean.ndim == 2 and law.mean.shape[0] != self.horizon:
+            raise fail(
+                name,
+                f"{law.mean.shape[0]} time steps",
+                f"cover the horizon of {self.horizon} steps",
+                "One row for each t = 0..horizon-1.",
+            )
+        return law
+
+    @property
+    def state_size(self) -> int:
+        """n."""
+        return self.system.state_size
+
+    @property
+    def input_size(self) -> int:
+        """m."""
+        return self.system.input_size
+
+    @property
+    def lifted_shape(self) -> tuple[int, int, int]:
+        """Shape (memory, m, n) of the full policy."""
+        return self.memory, self.input_size, self.state_size
+
+    @property
+    def policy_shape(self) -> tuple[int, int, int]:
+        """Shape of the free parameters."""
+        return self.structure.free_shape(self.lifted_shape)
+
+    @property
+    def dtype(self) -> Any:
+        """The floating-point type of the computation."""
+        leaves = jax.tree.leaves(eqx.filter(self, eqx.is_inexact_array))
+        return jnp.result_type(*leaves)
+
+    def lift(self, M: Any) -> Array:
+        """The full policy (memory, m, n) of free parameters M."""
+        return self.structure.lift(self.check_policy("M", M))
+
+    def check_policy(self, name: str, M: Any) -> Array:
+        """M as an array of free parameters; raises InputError on a wrong shape or non-finite entries."""
+        M = as_array(name, M)
+        labels = ("memory", "input", "state")
+        remedy = ""
+        if M.shape == self.lifted_shape and M.shape != self.policy_shape:
+            remedy = "This is the lifted policy: pass the free parameters of the structure."
+        elif M.ndim == 2 and (1, *M.shape) == self.policy_shape:
+            remedy = "Add the lag axis: M[None]."
+        check_shape(name, M, self.policy_shape, labels, remedy)
+        return M.astype(self.dtype)
+
+    def initial_policy(self) -> Array:
+        """The feasible policy nearest to zero: where solvers start when told nothing."""
+        return self.feasible_set.project(jnp.zeros(self.policy_shape, self.dtype))
+
+    def gains(self) -> Array:
+        """K_t for t = 0..T, shape (T+1, m, n)."""
+        return along_time(self.gain, 2, self.horizon + 1)
+
+    @property
+    def lifted_set(self) -> LiftedSet:
+        """The feasible set as perturbation laws see it."""
+        return LiftedSet(self.feasible_set, self.structure, self.lifted_shape)
+
+    def perturbation_bound(self) -> Array | None:
+        """ξ_t, (T,): almost-sure bound of ‖Δ_t‖ over the feasible set; None if unknown."""
+        return self.perturbation.bound(self.lifted_set, self.horizon)
+
+    def sensitivity(self) -> Array | None:
+        """ε_t, (T,), per unit of Frobenius norm of the free parameters; None if unknown."""
+        epsilon = self.perturbation.sensitivity(self.lifted_set, self.horizon)
+        return None if epsilon is None else self.structure.norm * epsilon
+
+
+def _zero_gain(gain: Array, m: int, n: int) -> Array:
+    if not isinstance(gain, jax.core.Tracer) and float(gain) != 0:
+        raise fail(
+            "gain", f"the number {float(gain)}", f"have shape (m, n) = ({m}, {n})", "Only 0 stands for none."
+        )
+    return jnp.zeros((m, n), gain.dtype)
+
+
+def _instance(name: str, value: Any, kind: type, remedy: str) -> Any:
+    if not isinstance(value, kind):
+        raise fail(name, type(value).__name__, f"be a {kind.__name__}", remedy)
+    return value

@@ -1,0 +1,90 @@
+"""Linear structures: free parameters -> the full policy (memory, input, state)."""
+
+import abc
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from perfcontrol._checks import check_integer, fail
+
+
+class AbstractStructure(eqx.Module):
+    """An injective linear map 𝓛 from free parameters to policies, with 𝓛ᵀ𝓛 = norm² I."""
+
+    @abc.abstractmethod
+    def lift(self, parameters: Array) -> Array:
+        """𝓛 applied to free parameters."""
+
+    @abc.abstractmethod
+    def adjoint(self, M: Array) -> Array:
+        """𝓛ᵀ applied to a policy: turns gradients by M into gradients by the free parameters."""
+
+    @abc.abstractmethod
+    def free_shape(self, policy_shape: tuple[int, int, int]) -> tuple[int, int, int]:
+        """Shape of the free parameters of policies of that shape."""
+
+    @property
+    @abc.abstractmethod
+    def norm(self) -> float:
+        """‖𝓛‖."""
+
+
+class FullStructure(AbstractStructure):
+    """Every entry of the policy is free."""
+
+    def lift(self, parameters: Array) -> Array:
+        return parameters
+
+    def adjoint(self, M: Array) -> Array:
+        return M
+
+    def free_shape(self, policy_shape: tuple[int, int, int]) -> tuple[int, int, int]:
+        return policy_shape
+
+    @property
+    def norm(self) -> float:
+        return 1.0
+
+
+class RepeatedBlock(AbstractStructure):
+    """(H, m/count, n/count) -> blockdiag(M, ..., M) with `count` copies in every lag."""
+
+    count: int = eqx.field(static=True)
+
+    def __init__(self, count: int):
+        self.count = check_integer("count", count, 1)
+
+    def lift(self, parameters: Array) -> Array:
+        H, m, n = parameters.shape
+        eye = jnp.eye(self.count, dtype=parameters.dtype)
+        return jnp.einsum("ab,hmn->hambn", eye, parameters).reshape(H, self.count * m, self.count * n)
+
+    def adjoint(self, M: Array) -> Array:
+        H, m, n = M.shape
+        blocks = M.reshape(H, self.count, m // self.count, self.count, n // self.count)
+        return jnp.einsum("haman->hmn", blocks)
+
+    def free_shape(self, policy_shape: tuple[int, int, int]) -> tuple[int, int, int]:
+        H, m, n = policy_shape
+        if m % self.count or n % self.count:
+            raise fail(
+                "structure",
+                f"m, n = {m}, {n}",
+                f"divide into {self.count} equal blocks",
+                "Choose a count that divides both the input and the state size.",
+            )
+        return H, m // self.count, n // self.count
+
+    @property
+    def norm(self) -> float:
+        return math.sqrt(self.count)
+
+
+def lifted(structure: AbstractStructure, parameters: Array) -> Array:
+    """`structure.lift` over any leading axes."""
+    flat = parameters.reshape(-1, *parameters.shape[-3:])
+    full = jax.vmap(structure.lift)(flat)
+    return full.reshape(*parameters.shape[:-3], *full.shape[1:])

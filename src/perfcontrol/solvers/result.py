@@ -1,0 +1,22 @@
+"""How a run ended. The text of a member says what to do."""
+
+import equinox as eqx
+
+
+class Result(eqx.Enumeration):
+    """Outcome of `solve`; compare with ==, read the text with `Result[result]`."""
+
+    success = "The run ended as asked."
+    running = "The run was stopped by max_steps before it ended: raise max_steps."
+    diverged = (
+        "The iterates grew past the divergence threshold. A stable policy may exist all the same: use a smaller or "
+        "diminishing step (pc.InverseStep), a bounded feasible set, or pc.StablePoint where moments are known."
+    )
+    nonfinite = (
+        "A gradient or iterate was not finite; the last finite iterate is returned. Use a smaller step, or check "
+        "the problem's scales."
+    )
+    not_converged = (
+        "The tolerance was not reached. The map may have no fixed point, or repeated minimisation does not "
+        "contract: try pc.StablePoint, another M0, or a larger tolerance."
+    )

@@ -1,0 +1,115 @@
+"""Repeated stochastic gradient descent: the paper's Algorithm 1."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Int
+
+from perfcontrol._checks import check_integer
+from perfcontrol.problem import PerformativeProblem
+from perfcontrol.solvers.gradients import Pathwise
+from perfcontrol.solvers.loop import AbstractSolver, State, start
+from perfcontrol.solvers.result import Result
+from perfcontrol.solvers.schedules import Greedy
+from perfcontrol.solvers.step_sizes import as_step_size
+
+DIVERGENCE = 1e8  # growth of ‖M‖ over 1 + ‖M_0‖ at which a run is called divergent
+
+
+class _Own(eqx.Module):
+    count: Int[Array, ""]
+    deployed: Array
+    threshold: Array
+    transform_state: Any
+
+
+class RSGD(AbstractSolver):
+    """M_{n+1} = Proj(M_n - η_n ∇J(M_n)), the gradient taken along paths of the world that reacts to M_n.
+
+    Differentiates in the evaluated policy alone, so its fixed points are performatively stable policies, not
+    performative optima. Unlike Algorithm 1 as printed, the terminal stage counts.
+
+    Args:
+        steps: N ≥ 1.
+        step_size: a number, `pc.InverseStep(phi1, phi2)`, or a function n -> η_n.
+        batch: paths per step.
+        gradient: `pc.Pathwise()`, or `pc.Exact()` for the mean field.
+        schedule: `pc.Greedy()`, or `pc.Lazy(k)` to deploy every k-th iterate.
+        transform: an optax-like gradient transformation (`init`, `update`), applied before the step size.
+
+    A run whose iterate grows 1e8-fold ends as `Result.diverged`, one that meets a non-finite number as
+    `Result.nonfinite`; both keep the last good iterate and the step where it happened.
+
+    References:
+        Algorithm 1; Theorem 1 for the step.
+    """
+
+    steps: int = eqx.field(static=True)
+    step_size: Any
+    batch: int = eqx.field(static=True)
+    gradient: Any
+    schedule: Any
+    transform: Any = eqx.field(static=True)
+
+    def __init__(
+        self,
+        steps: int,
+        step_size: Any,
+        batch: int = 1,
+        gradient: Any = None,
+        schedule: Any = None,
+        transform: Any = None,
+    ):
+        self.steps = check_integer("steps", steps, 1)
+        self.step_size = as_step_size(step_size)
+        self.batch = check_integer("batch", batch, 1)
+        self.gradient = Pathwise() if gradient is None else gradient
+        self.schedule = Greedy() if schedule is None else schedule
+        self.transform = transform
+
+    @property
+    def max_steps(self) -> int:
+        return self.steps
+
+    @property
+    def needs_key(self) -> bool:
+        return isinstance(self.gradient, Pathwise)
+
+    def check(self, problem: PerformativeProblem) -> None:
+        self.gradient.check(problem)
+
+    def init(self, problem: PerformativeProblem, M0: Array) -> State:
+        transform_state = None if self.transform is None else self.transform.init(M0)
+        threshold = DIVERGENCE * (1 + jnp.sqrt(jnp.sum(M0**2)))
+        return start(M0, _Own(jnp.zeros((), int), M0, threshold, transform_state))
+
+    def step(self, problem: PerformativeProblem, state: State, key: Array | None) -> State:
+        own, M = state.own, state.M
+        deployed = jnp.where(self.schedule.deploys(own.count), M, own.deployed)
+        gradient = self.gradient(problem, M, deployed, key, self.batch)
+        transform_state = own.transform_state
+        if self.transform is not None:
+            gradient, transform_state = self.transform.update(gradient, transform_state, M)
+        following = problem.feasible_set.project(M - self.step_size(own.count).astype(M.dtype) * gradient)
+        finite = jnp.all(jnp.isfinite(following))
+        diverged = jnp.sqrt(jnp.sum(following**2)) > own.threshold
+        good = finite & ~diverged
+        result = Result.where(
+            finite, Result.where(diverged, Result.diverged, Result.running), Result.nonfinite
+        )
+        kept = jax.tree.map(lambda new, old: jnp.where(good, new, old), transform_state, own.transform_state)
+        return State(
+            jnp.where(good, following, M),
+            state.steps + 1,
+            result,
+            _Own(own.count + 1, deployed, own.threshold, kept),
+        )
+
+    def finish(
+        self, problem: PerformativeProblem, state: State, stopped: bool
+    ) -> tuple[Result, dict[str, Array]]:
+        # A fixed number of steps is what was asked for: reaching it, or the max_steps of `solve`, is success.
+        result = Result.where(state.result == Result.running, Result.success, state.result)
+        return result, {"deployments": jnp.asarray(state.steps)}

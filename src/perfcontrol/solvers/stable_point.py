@@ -1,0 +1,128 @@
+"""The performatively stable policy itself: a fixed point of the best response, exactly and fast.
+
+Repeated minimisation while it contracts well; else Newton steps on F(M) = Φ(M) - M, whose linear systems
+(I - Φ'(M)) δ = F are solved by GMRES with products Φ'(M) δ, so that fixed points are found where repeated
+minimisation runs away from them.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from perfcontrol._checks import check_integer, check_tolerance
+from perfcontrol.evaluate.best_response import natural_residual, quadratic, respond, response_pushforward
+from perfcontrol.evaluate.exact import cost_to_go, require_moments
+from perfcontrol.problem import PerformativeProblem
+from perfcontrol.solvers.loop import AbstractSolver, State, start
+from perfcontrol.solvers.result import Result
+from perfcontrol.solvers.rrm import frobenius
+
+CONTRACTING = 0.1  # repeated minimisation goes on while each step shrinks the gap at least tenfold
+HALVINGS = 6
+KRYLOV = 30
+
+
+class _Own(eqx.Module):
+    response: Array  # Φ(M)
+    gap: Array  # ‖Φ(M) - M‖
+    ratio: Array  # of the last two gaps
+    unique: Array
+
+
+class StablePoint(AbstractSolver):
+    """The fixed point M^PS = Φ(M^PS), to a relative natural residual of `tolerance`.
+
+    Needs a quadratic cost and known moments; no sampling. Finds stable points at which repeated minimisation
+    diverges. `.stats`: `residual` (relative natural residual), `unique` (of the best response, at M^PS),
+    `rate` (last ratio of gaps).
+
+    Args:
+        tolerance: None for 1e-11 in float64, 1e-5 in float32.
+        max_steps: at most so many steps.
+    """
+
+    tolerance: float | None = eqx.field(static=True)
+    limit: int = eqx.field(static=True)
+
+    def __init__(self, tolerance: float | None = None, max_steps: int = 60):
+        self.tolerance = tolerance
+        self.limit = check_integer("max_steps", max_steps, 1)
+
+    @property
+    def max_steps(self) -> int:
+        return self.limit
+
+    def check(self, problem: PerformativeProblem) -> None:
+        require_moments(problem)
+        check_tolerance(self.tolerance, problem.dtype)
+
+    def init(self, problem: PerformativeProblem, M0: Array) -> State:
+        response = respond(problem, M0)
+        gap = frobenius(response.M - M0)
+        # A first step of repeated minimisation is always worth taking.
+        return start(M0, _Own(response.M, gap, jnp.zeros((), M0.dtype), response.unique))
+
+    def step(self, problem: PerformativeProblem, state: State, key: Array | None) -> State:
+        own = state.own
+        contracting = own.ratio <= CONTRACTING
+        F = own.response - state.M
+        direction = jax.lax.cond(
+            contracting, lambda: F, lambda: _newton_direction(problem, state.M, own.response)
+        )
+
+        # Repeated minimisation takes its step as it is; Newton halves its own until the gap shrinks.
+        def try_length(carry: Any) -> Any:
+            length, count, *_ = carry
+            M = problem.feasible_set.project(state.M + length * direction)
+            response = respond(problem, M)
+            return length / 2, count + 1, M, response.M, frobenius(response.M - M), response.unique
+
+        def unaccepted(carry: Any) -> Array:
+            _, count, _, _, gap, _ = carry
+            return (count == 0) | (~contracting & ~(gap < own.gap) & (count < HALVINGS))
+
+        one = jnp.ones((), F.dtype)
+        trial = (one, jnp.asarray(0), state.M, own.response, own.gap, own.unique)
+        _, _, M, response, gap, unique = jax.lax.while_loop(unaccepted, try_length, trial)
+        finite = jnp.isfinite(gap) & jnp.all(jnp.isfinite(M))
+        ratio = gap / jnp.where(own.gap > 0, own.gap, 1)
+        tolerance = check_tolerance(self.tolerance, problem.dtype)
+        scale = frobenius(M)
+        done = gap <= 0.1 * tolerance * jnp.where(scale > 0, scale, 1)
+        # A Newton step that no longer helps has reached rounding, or is stuck: `finish` tells which by the residual.
+        stalled = ~contracting & (gap >= own.gap)
+        result = Result.where(done | stalled, Result.success, Result.running)
+        result = Result.where(finite, result, Result.nonfinite)
+        good = finite & ~(stalled & ~done)
+        kept = jax.tree.map(
+            lambda new, old: jnp.where(good, new, old), _Own(response, gap, ratio, unique), own
+        )
+        return State(jnp.where(good, M, state.M), state.steps + 1, result, kept)
+
+    def finish(
+        self, problem: PerformativeProblem, state: State, stopped: bool
+    ) -> tuple[Result, dict[str, Array]]:
+        tolerance = check_tolerance(self.tolerance, problem.dtype)
+        world = cost_to_go(problem, problem.structure.lift(state.M))
+        form = quadratic(problem, world)
+        residual = natural_residual(problem, state.M, form.gradient(state.M), form)
+        unfinished = Result.running if stopped else Result.not_converged
+        result = Result.where(
+            residual <= tolerance,
+            Result.success,
+            Result.where(state.result == Result.nonfinite, Result.nonfinite, unfinished),
+        )
+        return result, {"residual": residual, "unique": state.own.unique, "rate": state.own.ratio}
+
+
+def _newton_direction(problem: PerformativeProblem, M: Array, response: Array) -> Array:
+    """δ with (I - Φ'(M)) δ = Φ(M) - M, by GMRES; half a step of repeated minimisation where that fails."""
+    pushforward = response_pushforward(problem, M, response)
+    F = response - M
+    direction, _ = jax.scipy.sparse.linalg.gmres(
+        lambda V: V - pushforward(V), F, tol=1e-10, restart=min(KRYLOV, M.size), maxiter=4
+    )
+    return jnp.where(jnp.all(jnp.isfinite(direction)), direction, F / 2)

@@ -1,0 +1,62 @@
+"""Step sizes η_n of iteration n = 0, 1, ..."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from perfcontrol._checks import as_array, fail, is_concrete
+
+
+class InverseStep(eqx.Module):
+    """η_n = phi1 / (n + phi2): the diminishing step of Theorem 1.
+
+    Args:
+        phi1, phi2: positive numbers.
+    """
+
+    phi1: Array
+    phi2: Array
+
+    def __init__(self, phi1: Any, phi2: Any):
+        self.phi1, self.phi2 = as_array("phi1", phi1), as_array("phi2", phi2)
+        for name, value in (("phi1", self.phi1), ("phi2", self.phi2)):
+            if is_concrete(value) and not (value.ndim == 0 and float(value) > 0):
+                raise fail(name, str(value), "be a positive number", "Theorem 1 needs both positive.")
+
+    def __call__(self, n: Array) -> Array:
+        return self.phi1 / (n + self.phi2)
+
+
+class ConstantStep(eqx.Module):
+    """η_n = size."""
+
+    size: Array
+
+    def __init__(self, size: Any):
+        self.size = as_array("step_size", size)
+        if is_concrete(self.size) and not (self.size.ndim == 0 and float(self.size) > 0):
+            raise fail(
+                "step_size", str(self.size), "be a positive number", "Or pass pc.InverseStep(phi1, phi2)."
+            )
+
+    def __call__(self, n: Array) -> Array:
+        return self.size
+
+
+class _FunctionStep(eqx.Module):
+    function: Callable = eqx.field(static=True)
+
+    def __call__(self, n: Array) -> Array:
+        return jnp.asarray(self.function(n))
+
+
+def as_step_size(value: Any) -> Any:
+    """A number, an `InverseStep`, or a function n -> η_n."""
+    if isinstance(value, InverseStep | ConstantStep | _FunctionStep):
+        return value
+    if callable(value):
+        return value if isinstance(value, eqx.Module) else _FunctionStep(value)
+    return ConstantStep(value)

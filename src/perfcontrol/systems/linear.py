@@ -1,0 +1,67 @@
+"""The linear system x_{t+1} = A_t x_t + B_t u_t (+ perturbation and noise, which belong to the problem)."""
+
+from typing import Any
+
+import equinox as eqx
+from jaxtyping import Array
+
+from perfcontrol._checks import as_array, check_shape, fail
+
+
+class LinearSystem(eqx.Module):
+    """State matrix A and input matrix B, constant or one per time step.
+
+    Args:
+        A: (n, n) or (T, n, n).
+        B: (n, m) or (T, n, m).
+
+    Raises:
+        InputError: shapes that do not fit, or non-finite entries.
+    """
+
+    A: Array
+    B: Array
+
+    def __init__(self, A: Any, B: Any):
+        self.A, self.B = as_array("A", A), as_array("B", B)
+        if self.A.ndim not in (2, 3):
+            raise fail(
+                "A", f"{self.A.shape}", "have shape (n, n) or (T, n, n)", "A scalar system needs [[a]]."
+            )
+        if self.B.ndim not in (2, 3):
+            raise fail(
+                "B", f"{self.B.shape}", "have shape (n, m) or (T, n, m)", "A single input needs a column."
+            )
+        n = self.A.shape[-1]
+        check_shape(
+            "A", self.A[..., :, :], (*self.A.shape[:-2], n, n), ("time",) * (self.A.ndim - 2) + ("n", "n")
+        )
+        if self.B.shape[-2] != n:
+            hint = (
+                "The last two axes look swapped: pass its transpose."
+                if self.B.shape[-1] == n
+                else "B has one row per state."
+            )
+            raise fail("B", f"{self.B.shape}", f"have {n} rows, as A has", hint)
+        if self.A.ndim == 3 and self.B.ndim == 3 and self.A.shape[0] != self.B.shape[0]:
+            raise fail(
+                "B",
+                f"{self.B.shape[0]} time steps",
+                f"have {self.A.shape[0]} time steps, as A has",
+                "Give both the same length, or one of them constant.",
+            )
+
+    @property
+    def state_size(self) -> int:
+        """n."""
+        return self.A.shape[-1]
+
+    @property
+    def input_size(self) -> int:
+        """m."""
+        return self.B.shape[-1]
+
+    @property
+    def horizon(self) -> int | None:
+        """T where a matrix varies in time, else None."""
+        return self.A.shape[0] if self.A.ndim == 3 else self.B.shape[0] if self.B.ndim == 3 else None
