@@ -71,9 +71,7 @@ def as_array(name: str, value: Any) -> Array:
     return array
 
 
-def check_shape(
-    name: str, array: Array, expected: Sequence[int], labels: Sequence[str], remedy: str = ""
-) -> None:
+def check_shape(name: str, array: Array, expected: Sequence[int], labels: Sequence[str], remedy: str = "") -> None:
     """Raise unless `array.shape == expected`; `labels` names the axes."""
     expected = tuple(expected)
     if tuple(array.shape) == expected:
@@ -113,9 +111,7 @@ def check_symmetric_psd(name: str, array: Array, remedy: str) -> None:
         return
     host = np.asarray(array, dtype=float)
     scale = np.max(np.abs(host), initial=0.0)
-    slack = (
-        100 * float(np.finfo(np.asarray(array).dtype).eps) * max(scale, np.finfo(float).tiny) * host.shape[-1]
-    )
+    slack = 100 * float(np.finfo(np.asarray(array).dtype).eps) * max(scale, np.finfo(float).tiny) * host.shape[-1]
     asymmetry = float(np.max(np.abs(host - np.swapaxes(host, -1, -2)), initial=0.0))
     if asymmetry > slack:
         raise fail(
@@ -141,9 +137,7 @@ def check_integer(name: str, value: Any, minimum: int) -> int:
 def check_key(key: Any) -> Any:
     """A JAX random key, typed or raw; there is no default."""
     if key is None:
-        raise fail(
-            "key", "None", "be a JAX random key", "Pass key=jax.random.key(0): randomness is explicit here."
-        )
+        raise fail("key", "None", "be a JAX random key", "Pass key=jax.random.key(0): randomness is explicit here.")
     if isinstance(key, int | np.integer):
         raise fail("key", repr(key), "be a JAX random key", f"Pass key=jax.random.key({key}).")
     if not isinstance(key, jax.Array):

@@ -48,8 +48,6 @@ def feedforward(M: Float[Array, "H m n"], w: Float[Array, "T n"]) -> Float[Array
     return jnp.einsum("imn,tin->tm", M, lagged(w, M.shape[0]))
 
 
-def feedforward_adjoint(
-    h: Float[Array, "T1 m"], w: Float[Array, "T n"], memory: int
-) -> Float[Array, "H m n"]:
+def feedforward_adjoint(h: Float[Array, "T1 m"], w: Float[Array, "T n"], memory: int) -> Float[Array, "H m n"]:
     """Σ_t h_t w_{t-i}ᵀ: the adjoint of `feedforward` in M."""
     return jnp.einsum("tm,tin->imn", h, lagged(w, memory))

@@ -106,9 +106,7 @@ class PerformativeProblem(eqx.Module):
             )
         self.noise = self._law("noise", noise, n)
         if isinstance(initial_state, Sequence):
-            raise fail(
-                "initial_state", "a Sequence", "be one random vector", "Pass an array (n,) or another law."
-            )
+            raise fail("initial_state", "a Sequence", "be one random vector", "Pass an array (n,) or another law.")
         self.initial_state = self._law(
             "initial_state",
             initial_state if isinstance(initial_state, AbstractRandomVector) else Constant(initial_state),
@@ -204,9 +202,7 @@ class PerformativeProblem(eqx.Module):
 
 def _zero_gain(gain: Array, m: int, n: int) -> Array:
     if not isinstance(gain, jax.core.Tracer) and float(gain) != 0:
-        raise fail(
-            "gain", f"the number {float(gain)}", f"have shape (m, n) = ({m}, {n})", "Only 0 stands for none."
-        )
+        raise fail("gain", f"the number {float(gain)}", f"have shape (m, n) = ({m}, {n})", "Only 0 stands for none.")
     return jnp.zeros((m, n), gain.dtype)
 
 

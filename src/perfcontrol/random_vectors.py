@@ -218,13 +218,9 @@ class TruncatedGaussian(AbstractRandomVector):
         self.radius = as_array("bound", bound)
         check_shape("bound", self.radius, (), (), "Pass one number, in standard deviations.")
         if not is_concrete(self.radius) or not is_concrete(spread):
-            raise fail(
-                "bound", "a traced value", "be known when the law is built", "Build the law outside jit."
-            )
+            raise fail("bound", "a traced value", "be known when the law is built", "Build the law outside jit.")
         if float(self.radius) <= 0:
-            raise fail(
-                "bound", f"{float(self.radius)}", "be positive", "Pass a radius in standard deviations."
-            )
+            raise fail("bound", f"{float(self.radius)}", "be positive", "Pass a radius in standard deviations.")
         values, vectors = np.linalg.eigh(np.asarray(spread, dtype=float))
         kept = values > max(values.max(initial=0.0), 0.0) * len(values) * float(jnp.finfo(spread.dtype).eps)
         self.rank = max(int(kept.sum()), 1)
@@ -248,7 +244,7 @@ class TruncatedGaussian(AbstractRandomVector):
 
     @property
     def bound(self) -> Array:
-        # ‖mean‖ + radius √λ_max(Σ): attained when the mean lies along the leading eigenvector, else an upper bound.
+        # ‖mean‖ + radius √λ_max(Σ): attained if the mean lies along the leading eigenvector, else an upper bound.
         return jnp.linalg.norm(self.centre) + self.radius * jnp.linalg.norm(self.factor, ord=2)
 
     def sample(self, key: Key[Array, ""], horizon: int) -> Array:
@@ -266,15 +262,11 @@ class TruncatedGaussian(AbstractRandomVector):
         cell = jnp.clip(jnp.searchsorted(self.probability_grid, probability, side="right"), 1, 512)
         low, high = self.radius_grid[cell - 1], self.radius_grid[cell]
         p_low, p_high = self.probability_grid[cell - 1], self.probability_grid[cell]
-        radius = low + (high - low) * (probability - p_low) / jnp.maximum(
-            p_high - p_low, jnp.finfo(low.dtype).tiny
-        )
+        radius = low + (high - low) * (probability - p_low) / jnp.maximum(p_high - p_low, jnp.finfo(low.dtype).tiny)
         log_constant = jnp.log(mass) + jax.scipy.special.gammaln(half) + (half - 1) * jnp.log(2.0)
         for _ in range(3):
             error = gammainc(half, radius**2 / 2) / mass - probability
-            density = jnp.exp(
-                (self.rank - 1) * jnp.log(jnp.maximum(radius, 1e-30)) - radius**2 / 2 - log_constant
-            )
+            density = jnp.exp((self.rank - 1) * jnp.log(jnp.maximum(radius, 1e-30)) - radius**2 / 2 - log_constant)
             radius = jnp.clip(radius - error / jnp.maximum(density, 1e-30), low, high)
         return radius
 
@@ -287,9 +279,7 @@ class Constant(AbstractRandomVector):
     def __init__(self, value: Any):
         self.value = as_array("value", value)
         if self.value.ndim > 1:
-            raise fail(
-                "value", f"{self.value.shape}", "be a vector (n,)", "Use Sequence for one vector per time."
-            )
+            raise fail("value", f"{self.value.shape}", "be a vector (n,)", "Use Sequence for one vector per time.")
 
     def resize(self, size: int) -> "AbstractRandomVector":
         return Constant(jnp.broadcast_to(self.value, (size,))) if self.value.ndim == 0 else self

@@ -24,9 +24,7 @@ class Paths(NamedTuple):
     perturbation: np.ndarray
 
 
-def enumerate_paths(
-    noise: Sequence[FiniteLaw], perturbations: Sequence[FiniteLaw], initial: FiniteLaw
-) -> Paths:
+def enumerate_paths(noise: Sequence[FiniteLaw], perturbations: Sequence[FiniteLaw], initial: FiniteLaw) -> Paths:
     """Every combination of one atom of x_0, of each w_t and of each Delta_t, with the product probability.
 
     Args:
@@ -94,9 +92,7 @@ def simulate(A, B, K, M, paths: Paths) -> tuple[np.ndarray, np.ndarray, np.ndarr
         z, dz = x[:, t], dx[:, t]
         if on_input:
             z, dz = np.concatenate([z, u[:, t]], axis=1), np.concatenate([dz, du[:, t]], axis=1)
-        x[:, t + 1] = (
-            x[:, t] @ A[t].T + u[:, t] @ B[t].T + np.einsum("pab,pb->pa", delta, z) + paths.noise[:, t]
-        )
+        x[:, t + 1] = x[:, t] @ A[t].T + u[:, t] @ B[t].T + np.einsum("pab,pb->pa", delta, z) + paths.noise[:, t]
         dx[:, t + 1] = (
             np.einsum("ab,pb...->pa...", A[t], dx[:, t])
             + np.einsum("ab,pb...->pa...", B[t], du[:, t])

@@ -24,9 +24,7 @@ def infinite_horizon_cost(A, B, K, directions, variances, Q, R) -> tuple[float, 
     """
     n = A.shape[0]
     closed_loop = A - B @ K
-    operator = np.kron(
-        closed_loop.T, closed_loop.T
-    )  # of vec(P), row-major: vec(X' P X) = (X' kron X') vec(P)
+    operator = np.kron(closed_loop.T, closed_loop.T)  # of vec(P), row-major: vec(X' P X) = (X' kron X') vec(P)
     for direction, variance in zip(directions, variances, strict=True):
         operator = operator + variance * np.kron(direction.T, direction.T)
     if np.abs(np.linalg.eigvals(operator)).max() >= 1:

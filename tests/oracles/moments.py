@@ -44,9 +44,7 @@ def expected_cost_moments(
         cross: N (T + 1, n, m), or None for zero.
         state_target: (T + 1, n), or None for zero. input_target: (T + 1, m), or None for zero.
     """
-    A, B, K, Q, R, M, Theta = (
-        np.asarray(value, dtype=float) for value in (A, B, K, Q, R, M, perturbation_mean)
-    )
+    A, B, K, Q, R, M, Theta = (np.asarray(value, dtype=float) for value in (A, B, K, Q, R, M, perturbation_mean))
     horizon, n, m = B.shape
     memory = M.shape[0]
     N = np.zeros((horizon + 1, n, m)) if cross is None else np.asarray(cross, dtype=float)
@@ -76,9 +74,7 @@ def expected_cost_moments(
         for i in range(1, memory + 1):
             select_input[:, lag(i)] += M[i - 1]
 
-        deviation = np.concatenate(
-            [select_state - np.outer(xs[t], constant), select_input - np.outer(us[t], constant)]
-        )
+        deviation = np.concatenate([select_state - np.outer(xs[t], constant), select_input - np.outer(us[t], constant)])
         weight = np.block([[Q[t], N[t]], [N[t].T, R[t]]])
         total += np.trace(weight @ deviation @ S @ deviation.T)
         if t == horizon:

@@ -223,9 +223,7 @@ def test_printed_gradient_and_state_match_forward_sensitivity_on_single_paths(ca
     for p in range(len(chosen)):
         path = {"deltas": paths.perturbation[p], "w": paths.noise[p]}
         for t in range(x.shape[1]):
-            state = printed_state(
-                **problem.system, **path, M=problem.M, initial_state=paths.initial_state[p], t=t
-            )
+            state = printed_state(**problem.system, **path, M=problem.M, initial_state=paths.initial_state[p], t=t)
             np.testing.assert_allclose(state, x[p, t], rtol=0, atol=1e-13 * max(1.0, np.abs(x[p]).max()))
         printed = printed_gradient(
             **problem.system, **path, x=x[p], M_shape=problem.M.shape, grad_x=grad_x[p], grad_u=grad_u[p]
@@ -279,9 +277,7 @@ def test_enumerated_cost_equals_a_sum_done_by_hand():
     perturbations = [(np.array([[[0.2]], [[-0.2]]]), np.array([0.5, 0.5]))]
     initial = (np.array([[2.0]]), np.array([1.0]))
     one, two = np.ones((1, 1, 1)), np.ones((2, 1, 1))
-    cost, gradient = enumerate_cost(
-        0.5 * one, one, 0 * two, two, two, 4.0 * one, noise, perturbations, initial
-    )
+    cost, gradient = enumerate_cost(0.5 * one, one, 0 * two, two, two, 4.0 * one, noise, perturbations, initial)
     assert cost == pytest.approx(4 + (4 * (0.25 + 0.04) + 3) + 16 * 3, rel=1e-14)
     assert gradient == pytest.approx(np.array([[[2 * 4 * 3.0]]]), rel=1e-14)
 
@@ -308,9 +304,7 @@ def test_multiplicative_noise_cost_matches_published_number():
 
 
 def test_generalised_riccati_gain_matches_published_gain():
-    gain = generalised_riccati_gain(
-        A_PUBLISHED, B_PUBLISHED, DIRECTION_PUBLISHED[None], [0.1], np.eye(3), np.eye(2)
-    )
+    gain = generalised_riccati_gain(A_PUBLISHED, B_PUBLISHED, DIRECTION_PUBLISHED[None], [0.1], np.eye(3), np.eye(2))
     np.testing.assert_allclose(gain, GAIN_PUBLISHED, rtol=0, atol=1e-8)
 
 

@@ -56,9 +56,7 @@ class QuadraticCost(AbstractCost):
             n, m = self.Q.shape[-1], self.R.shape[-1]
             if self.cross.shape[-2:] != (n, m):
                 swapped = (
-                    "The last two axes look swapped: pass its transpose."
-                    if self.cross.shape[-2:] == (m, n)
-                    else ""
+                    "The last two axes look swapped: pass its transpose." if self.cross.shape[-2:] == (m, n) else ""
                 )
                 raise fail(
                     "cross",
@@ -90,9 +88,7 @@ class QuadraticCost(AbstractCost):
         """[[Q, cross], [crossᵀ, R]] for every time."""
         n, m = self.Q.shape[-1], self.R.shape[-1]
         Q, R = along_time(self.Q, 2, length), along_time(self.R, 2, length)
-        cross = (
-            jnp.zeros((length, n, m), Q.dtype) if self.cross is None else along_time(self.cross, 2, length)
-        )
+        cross = jnp.zeros((length, n, m), Q.dtype) if self.cross is None else along_time(self.cross, 2, length)
         return jnp.concatenate(
             [jnp.concatenate([Q, cross], axis=-1), jnp.concatenate([transpose(cross), R], axis=-1)], axis=-2
         )

@@ -97,13 +97,11 @@ def quadratic(problem: PerformativeProblem, world: CostToGo) -> Quadratic:
     return Quadratic(linear, gradient, 1 / _power_iteration(gradient, linear), None)
 
 
-def _hessian_matrix(
-    problem: PerformativeProblem, world: CostToGo, gradient: Operator, linear: Array
-) -> Array:
+def _hessian_matrix(problem: PerformativeProblem, world: CostToGo, gradient: Operator, linear: Array) -> Array:
     """The Hessian in the free parameters (p, p)."""
     size = linear.size
     if _stationary(problem):
-        H, m, n = problem.lifted_shape
+        H, m, _ = problem.lifted_shape
         w = problem.noise.mean
         G = impulse_form(world, H).G
         blocks = jnp.stack([G, _constant_mean_form(problem, world)]).reshape(2, H, m, H, m)

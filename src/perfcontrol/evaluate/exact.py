@@ -56,10 +56,7 @@ def require_moments(problem: PerformativeProblem) -> None:
     if not isinstance(problem.cost, QuadraticCost):
         raise fail("cost", type(problem.cost).__name__, "be a QuadraticCost for exact evaluation", remedy)
     policy = jax.ShapeDtypeStruct(problem.lifted_shape, problem.dtype)
-    if (
-        eqx.filter_eval_shape(lambda p, M: p.covariance(M, problem.horizon), problem.perturbation, policy)
-        is None
-    ):
+    if eqx.filter_eval_shape(lambda p, M: p.covariance(M, problem.horizon), problem.perturbation, policy) is None:
         raise fail(
             "perturbation",
             f"{type(problem.perturbation).__name__} without known moments",
@@ -119,7 +116,7 @@ def _chains(world: CostToGo, memory: int) -> tuple[Array, Array]:
 
     X[0] = S and X[d] = Y[d-1]_t B_{t-d}, (H, T+1, m, m); zero where t < d.
     """
-    T, n = world.F.shape[:2]
+    T = world.F.shape[0]
 
     def shifted(array: Array, d: int) -> Array:
         """array_{t-d} for t = 0..T, zero where t < d."""
@@ -230,9 +227,9 @@ def cost_and_gradient(problem: PerformativeProblem, world: CostToGo, policy: Arr
 
 def exact_cost(problem: PerformativeProblem, M: Array, deployed: Array) -> Array:
     """C_T(M; deployed), free parameters; pure, differentiable in both."""
-    return cost_and_gradient(
-        problem, cost_to_go(problem, problem.structure.lift(deployed)), problem.structure.lift(M)
-    )[0]
+    return cost_and_gradient(problem, cost_to_go(problem, problem.structure.lift(deployed)), problem.structure.lift(M))[
+        0
+    ]
 
 
 def exact_gradient(problem: PerformativeProblem, M: Array, deployed: Array) -> Array:
@@ -271,9 +268,7 @@ def expected_cost(problem: PerformativeProblem, M: Any, *, deployed: Any = None)
     return _compiled_cost(problem, M, reacting)
 
 
-def expected_gradient(
-    problem: PerformativeProblem, M: Any, *, deployed: Any = None, total: bool = False
-) -> Array:
+def expected_gradient(problem: PerformativeProblem, M: Any, *, deployed: Any = None, total: bool = False) -> Array:
     """Exact ∇_1 C_T(M; deployed), the first argument alone; `total=True`: the derivative of C_T(M; M).
 
     A performatively stable policy has ∇_1 C_T(M; M) = 0 (or satisfies the variational inequality on the feasible

@@ -70,9 +70,7 @@ def moments_of(problem: PerformativeProblem, policy: Array, reacting: Array) -> 
         following = symmetrise(joint_t @ z_second @ joint_t.T + reaction + second_w_t + mixed + mixed.T)
         # E[z_t w_{t-i}ᵀ] moves one lag on
         xv_past = jnp.concatenate([X, v_past_t], axis=1)
-        moved = (
-            jnp.einsum("ab,ibk->iak", joint_t @ through, xv_past) + w_t[None, :, None] * past_t[:, None, :]
-        )
+        moved = jnp.einsum("ab,ibk->iak", joint_t @ through, xv_past) + w_t[None, :, None] * past_t[:, None, :]
         X_next = jnp.concatenate([(mixed + second_w_t)[None], moved[:-1]])
         return (driven + w_t, following, X_next), (z_mean, z_second)
 
@@ -99,17 +97,11 @@ def cost_by_moments(problem: PerformativeProblem, M: Array, deployed: Array) -> 
     """C_T(M; deployed) from the forward recursion; pure."""
     moments = moments_of(problem, problem.structure.lift(M), problem.structure.lift(deployed))
     form = problem.cost.form(problem.horizon)  # type: ignore[attr-defined]
-    return (
-        jnp.sum(form.matrix * moments.second)
-        + 2 * jnp.sum(form.linear * moments.mean)
-        + jnp.sum(form.constant)
-    )
+    return jnp.sum(form.matrix * moments.second) + 2 * jnp.sum(form.linear * moments.mean) + jnp.sum(form.constant)
 
 
 _compiled_moments = eqx.filter_jit(
-    lambda problem, M, deployed: moments_of(
-        problem, problem.structure.lift(M), problem.structure.lift(deployed)
-    )
+    lambda problem, M, deployed: moments_of(problem, problem.structure.lift(M), problem.structure.lift(deployed))
 )
 _compiled_cost = eqx.filter_jit(cost_by_moments)
 

@@ -102,16 +102,12 @@ def run_path(problem: PerformativeProblem, policy: Array, x0: Array, w: Array, d
 
 
 @eqx.filter_jit
-def _simulate(
-    problem: PerformativeProblem, M: Array, deployed: Array, key: Array, samples: int
-) -> Trajectories:
+def _simulate(problem: PerformativeProblem, M: Array, deployed: Array, key: Array, samples: int) -> Trajectories:
     policy, reacting = problem.structure.lift(M), problem.structure.lift(deployed)
 
     def one(index: Array) -> Trajectories:
         path = sample_path(problem, policy, reacting, jax.random.fold_in(key, index))
-        return Trajectories(
-            path.x, path.u, path.w, jnp.sum(problem.cost.path_cost(path.x, path.u)), path.draws
-        )
+        return Trajectories(path.x, path.u, path.w, jnp.sum(problem.cost.path_cost(path.x, path.u)), path.draws)
 
     return jax.lax.map(one, jnp.arange(samples), batch_size=min(BATCH, samples))
 

@@ -87,9 +87,7 @@ def stock_market(
     return PerformativeProblem(
         system=LinearSystem(growth * jnp.eye(2 * STOCKS), jnp.eye(2 * STOCKS)),
         horizon=HORIZON,
-        noise=Linear(
-            unit_noise, np.vstack([eye, eye]), np.concatenate([-np.full(STOCKS, 0.5), np.zeros(STOCKS)])
-        ),
+        noise=Linear(unit_noise, np.vstack([eye, eye]), np.concatenate([-np.full(STOCKS, 0.5), np.zeros(STOCKS)])),
         cost=QuadraticCost(shown, shown),
         memory=1,
         perturbation=StockPerturbation(stock_sensitivities(order), rate, exposure, volatility),

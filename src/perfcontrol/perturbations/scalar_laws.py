@@ -30,14 +30,10 @@ def _truncated_gaussian(key: Key[Array, ""], shape: tuple[int, ...], dtype: Any)
     return jax.random.truncated_normal(key, -CUTOFF, CUTOFF, shape, dtype) / _NORMAL_SCALE
 
 
-_mean_absolute_normal = (
-    2 * integrate.quad(lambda z: z * stats.truncnorm.pdf(z, -CUTOFF, CUTOFF), 0, CUTOFF)[0]
-)
+_mean_absolute_normal = 2 * integrate.quad(lambda z: z * stats.truncnorm.pdf(z, -CUTOFF, CUTOFF), 0, CUTOFF)[0]
 
 SCALAR_LAWS = {
     "rademacher": ScalarLaw(random_signs, 1.0, 1.0),
     "uniform": ScalarLaw(_uniform, math.sqrt(3), math.sqrt(3) / 2),
-    "truncated_gaussian": ScalarLaw(
-        _truncated_gaussian, CUTOFF / _NORMAL_SCALE, _mean_absolute_normal / _NORMAL_SCALE
-    ),
+    "truncated_gaussian": ScalarLaw(_truncated_gaussian, CUTOFF / _NORMAL_SCALE, _mean_absolute_normal / _NORMAL_SCALE),
 }

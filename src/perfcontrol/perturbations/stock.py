@@ -8,6 +8,7 @@ stock l) and e_i = exp((rate - v_i²/2)/T + v_i/√T) for the volatility v_i, V 
 Every operator here costs O(L) or O(L²); nothing dense is built in the loops.
 """
 
+import itertools
 import math
 from typing import Any
 
@@ -46,7 +47,7 @@ def growth_moments(log_sensitivity: np.ndarray, rate: float, kind: str) -> tuple
         ends = (-np.inf, math.log(LIMIT)) if kind == "lognormal" else (-LIMIT, LIMIT)
         kinks = [float(np.clip((end - centre) / SPREAD, -9.0, 9.0)) for end in ends]
         edges = np.unique([-9.0, *kinks, 9.0])
-        for low, high in zip(edges[:-1], edges[1:], strict=True):
+        for low, high in itertools.pairwise(edges):
             normal = (low + high) / 2 + (high - low) / 2 * nodes
             density = np.exp(-(normal**2) / 2) / math.sqrt(2 * math.pi) * weights * (high - low) / 2
             growth = _growth(_volatility(normal, centre, kind, np), rate, horizon, np)
@@ -131,29 +132,21 @@ class StockPerturbation(AbstractPerturbation):
         if sensitivities.ndim != 1 or bool(jnp.any(sensitivities <= 0)):
             raise fail("sensitivities", f"{sensitivities.shape}", "be positive numbers (T,)", "One per day.")
         if volatility not in VOLATILITIES:
-            raise fail(
-                "volatility", repr(volatility), f"be one of {VOLATILITIES}", "Pass one of these names."
-            )
+            raise fail("volatility", repr(volatility), f"be one of {VOLATILITIES}", "Pass one of these names.")
         self.rate, self.exposure = as_array("rate", rate), as_array("exposure", exposure)
         for name, value in (("rate", self.rate), ("exposure", self.exposure)):
             check_shape(name, value, (), (), "Pass one number.")
         self.log_sensitivity = jnp.log(sensitivities)
         self.volatility = volatility
-        first, second = growth_moments(
-            np.log(np.asarray(sensitivities, dtype=float)), float(self.rate), volatility
-        )
+        first, second = growth_moments(np.log(np.asarray(sensitivities, dtype=float)), float(self.rate), volatility)
         self.first_moment = jnp.asarray(first, sensitivities.dtype)
         self.second_moment = jnp.asarray(second, sensitivities.dtype)
 
     def check(self, policy_shape: tuple[int, int, int], horizon: int) -> None:
         _, m, n = policy_shape
         if m != n or n % 2:
-            raise fail(
-                "perturbation", f"m, n = {m}, {n}", "have m = n = 2L", "The state is [r; q] of L stocks."
-            )
-        check_shape(
-            "sensitivities", self.log_sensitivity, (horizon,), ("horizon",), "Give one sensitivity per day."
-        )
+            raise fail("perturbation", f"m, n = {m}, {n}", "have m = n = 2L", "The state is [r; q] of L stocks.")
+        check_shape("sensitivities", self.log_sensitivity, (horizon,), ("horizon",), "Give one sensitivity per day.")
 
     def portfolio(self, M: Array) -> Array:
         """The portfolio (L, L) behind a lifted policy."""

@@ -22,9 +22,7 @@ class FrobeniusBall(AbstractSet):
         self.limit = as_array("radius", radius)
         check_shape("radius", self.limit, (), (), "Pass one number.")
         if is_concrete(self.limit) and float(self.limit) < 0:
-            raise fail(
-                "radius", f"{float(self.limit)}", "be nonnegative: the set is empty", "Pass a radius ≥ 0."
-            )
+            raise fail("radius", f"{float(self.limit)}", "be nonnegative: the set is empty", "Pass a radius ≥ 0.")
 
     def project(self, M: Array) -> Array:
         # The inner where keeps the derivative finite at M = 0.

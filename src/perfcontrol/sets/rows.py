@@ -14,9 +14,6 @@ class _Rows(AbstractSet):
 
     total: Array
 
-    def __init__(self, total: Any):
-        self.total = as_array("total", total)
-
     @property
     def row_total(self) -> Array:
         return self.total
@@ -37,6 +34,9 @@ class RowSum(_Rows):
     Args:
         total: a number or (memory, input).
     """
+
+    def __init__(self, total: Any):
+        self.total = as_array("total", total)
 
     def project(self, M: Array) -> Array:
         excess = jnp.sum(M, axis=-1) - self.total
@@ -61,7 +61,7 @@ class RowSimplex(_Rows):
     """
 
     def __init__(self, total: Any):
-        super().__init__(total)
+        self.total = as_array("total", total)
         if is_concrete(self.total) and bool(jnp.any(self.total < 0)):
             raise fail(
                 "total",

@@ -61,9 +61,7 @@ class AbstractSolver(eqx.Module):
         """One iteration; `key` is that iteration's own."""
 
     @abc.abstractmethod
-    def finish(
-        self, problem: PerformativeProblem, state: State, stopped: bool
-    ) -> tuple[Result, dict[str, Array]]:
+    def finish(self, problem: PerformativeProblem, state: State, stopped: bool) -> tuple[Result, dict[str, Array]]:
         """Result and statistics of the last state; `stopped` says that max_steps of `solve` cut the run short."""
 
 
@@ -118,9 +116,7 @@ def _run(
 _compiled_run = eqx.filter_jit(_run)
 _compiled_record = eqx.filter_jit(lambda record, M: record(M))
 _compiled_init = eqx.filter_jit(lambda solver, problem, M0: solver.init(problem, M0))
-_compiled_finish = eqx.filter_jit(
-    lambda solver, problem, state, stopped: solver.finish(problem, state, stopped)
-)
+_compiled_finish = eqx.filter_jit(lambda solver, problem, state, stopped: solver.finish(problem, state, stopped))
 
 
 def _identity(M: Array) -> Array:

@@ -77,9 +77,7 @@ class RRM(AbstractSolver):
         own = _Own(moved, rate, response.unique, state.own.threshold)
         return State(jnp.where(good, following, state.M), state.steps + 1, result, own)
 
-    def finish(
-        self, problem: PerformativeProblem, state: State, stopped: bool
-    ) -> tuple[Result, dict[str, Array]]:
+    def finish(self, problem: PerformativeProblem, state: State, stopped: bool) -> tuple[Result, dict[str, Array]]:
         unfinished = Result.running if stopped else Result.not_converged
         result = Result.where(state.result == Result.running, unfinished, state.result)
         stats = {

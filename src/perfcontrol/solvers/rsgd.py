@@ -96,9 +96,7 @@ class RSGD(AbstractSolver):
         finite = jnp.all(jnp.isfinite(following))
         diverged = jnp.sqrt(jnp.sum(following**2)) > own.threshold
         good = finite & ~diverged
-        result = Result.where(
-            finite, Result.where(diverged, Result.diverged, Result.running), Result.nonfinite
-        )
+        result = Result.where(finite, Result.where(diverged, Result.diverged, Result.running), Result.nonfinite)
         kept = jax.tree.map(lambda new, old: jnp.where(good, new, old), transform_state, own.transform_state)
         return State(
             jnp.where(good, following, M),
@@ -107,9 +105,7 @@ class RSGD(AbstractSolver):
             _Own(own.count + 1, deployed, own.threshold, kept),
         )
 
-    def finish(
-        self, problem: PerformativeProblem, state: State, stopped: bool
-    ) -> tuple[Result, dict[str, Array]]:
+    def finish(self, problem: PerformativeProblem, state: State, stopped: bool) -> tuple[Result, dict[str, Array]]:
         # A fixed number of steps is what was asked for: reaching it, or the max_steps of `solve`, is success.
         result = Result.where(state.result == Result.running, Result.success, state.result)
         return result, {"deployments": jnp.asarray(state.steps)}

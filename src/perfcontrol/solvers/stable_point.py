@@ -69,9 +69,7 @@ class StablePoint(AbstractSolver):
         own = state.own
         contracting = own.ratio <= CONTRACTING
         F = own.response - state.M
-        direction = jax.lax.cond(
-            contracting, lambda: F, lambda: _newton_direction(problem, state.M, own.response)
-        )
+        direction = jax.lax.cond(contracting, lambda: F, lambda: _newton_direction(problem, state.M, own.response))
 
         # Repeated minimisation takes its step as it is; Newton halves its own until the gap shrinks.
         def try_length(carry: Any) -> Any:
@@ -97,14 +95,10 @@ class StablePoint(AbstractSolver):
         result = Result.where(done | stalled, Result.success, Result.running)
         result = Result.where(finite, result, Result.nonfinite)
         good = finite & ~(stalled & ~done)
-        kept = jax.tree.map(
-            lambda new, old: jnp.where(good, new, old), _Own(response, gap, ratio, unique), own
-        )
+        kept = jax.tree.map(lambda new, old: jnp.where(good, new, old), _Own(response, gap, ratio, unique), own)
         return State(jnp.where(good, M, state.M), state.steps + 1, result, kept)
 
-    def finish(
-        self, problem: PerformativeProblem, state: State, stopped: bool
-    ) -> tuple[Result, dict[str, Array]]:
+    def finish(self, problem: PerformativeProblem, state: State, stopped: bool) -> tuple[Result, dict[str, Array]]:
         tolerance = check_tolerance(self.tolerance, problem.dtype)
         world = cost_to_go(problem, problem.structure.lift(state.M))
         form = quadratic(problem, world)

@@ -38,9 +38,7 @@ class ConstantStep(eqx.Module):
     def __init__(self, size: Any):
         self.size = as_array("step_size", size)
         if is_concrete(self.size) and not (self.size.ndim == 0 and float(self.size) > 0):
-            raise fail(
-                "step_size", str(self.size), "be a positive number", "Or pass pc.InverseStep(phi1, phi2)."
-            )
+            raise fail("step_size", str(self.size), "be a positive number", "Or pass pc.InverseStep(phi1, phi2).")
 
     def __call__(self, n: Array) -> Array:
         return self.size

@@ -25,17 +25,11 @@ class LinearSystem(eqx.Module):
     def __init__(self, A: Any, B: Any):
         self.A, self.B = as_array("A", A), as_array("B", B)
         if self.A.ndim not in (2, 3):
-            raise fail(
-                "A", f"{self.A.shape}", "have shape (n, n) or (T, n, n)", "A scalar system needs [[a]]."
-            )
+            raise fail("A", f"{self.A.shape}", "have shape (n, n) or (T, n, n)", "A scalar system needs [[a]].")
         if self.B.ndim not in (2, 3):
-            raise fail(
-                "B", f"{self.B.shape}", "have shape (n, m) or (T, n, m)", "A single input needs a column."
-            )
+            raise fail("B", f"{self.B.shape}", "have shape (n, m) or (T, n, m)", "A single input needs a column.")
         n = self.A.shape[-1]
-        check_shape(
-            "A", self.A[..., :, :], (*self.A.shape[:-2], n, n), ("time",) * (self.A.ndim - 2) + ("n", "n")
-        )
+        check_shape("A", self.A[..., :, :], (*self.A.shape[:-2], n, n), ("time",) * (self.A.ndim - 2) + ("n", "n"))
         if self.B.shape[-2] != n:
             hint = (
                 "The last two axes look swapped: pass its transpose."
