@@ -5,7 +5,7 @@ Two policies are told apart everywhere: `M` is evaluated or improved, `deployed`
 
 from perfcontrol import experiments
 from perfcontrol._checks import InputError
-from perfcontrol.costs import AbstractCost, QuadraticCost
+from perfcontrol.costs import AbstractCost, ConvexCost, QuadraticCost
 from perfcontrol.evaluate import (
     Estimate,
     StateMoments,
@@ -24,8 +24,11 @@ from perfcontrol.evaluate import (
 )
 from perfcontrol.perturbations import (
     AbstractPerturbation,
+    DensePerturbation,
     DirectionalPerturbation,
+    FinitePerturbation,
     NoPerturbation,
+    SampledPerturbation,
     StockPerturbation,
 )
 from perfcontrol.policy import DisturbanceAction
@@ -45,11 +48,15 @@ from perfcontrol.random_vectors import (
 from perfcontrol.sets import (
     AbstractSet,
     AbstractStructure,
+    Box,
     FrobeniusBall,
     FullStructure,
+    Intersection,
     RepeatedBlock,
     RowSimplex,
     RowSum,
+    SpectralBall,
+    Support,
     Unconstrained,
 )
 from perfcontrol.solvers import (
@@ -79,18 +86,23 @@ __all__ = [
     "AbstractSolver",
     "AbstractStructure",
     "Affine",
+    "Box",
     "Constant",
+    "ConvexCost",
+    "DensePerturbation",
     "DirectionalPerturbation",
     "DisturbanceAction",
     "Empirical",
     "Estimate",
     "Exact",
+    "FinitePerturbation",
     "FrobeniusBall",
     "FullStructure",
     "Function",
     "Gaussian",
     "Greedy",
     "InputError",
+    "Intersection",
     "InverseStep",
     "Lazy",
     "Linear",
@@ -104,12 +116,15 @@ __all__ = [
     "Result",
     "RowSimplex",
     "RowSum",
+    "SampledPerturbation",
     "Sequence",
     "Solution",
     "SolveError",
+    "SpectralBall",
     "StablePoint",
     "StateMoments",
     "StockPerturbation",
+    "Support",
     "Trajectories",
     "TruncatedGaussian",
     "Unconstrained",

@@ -1,9 +1,10 @@
 """Input checks with one wording of errors: the argument, what was got, what is required, the remedy."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.core
 import jax.numpy as jnp
@@ -71,7 +72,7 @@ def as_array(name: str, value: Any) -> Array:
     return array
 
 
-def check_shape(name: str, array: Array, expected: Sequence[int], labels: Sequence[str], remedy: str = "") -> None:
+def check_shape(name: str, array: Any, expected: Sequence[int], labels: Sequence[str], remedy: str = "") -> None:
     """Raise unless `array.shape == expected`; `labels` names the axes."""
     expected = tuple(expected)
     if tuple(array.shape) == expected:
@@ -167,3 +168,21 @@ def check_tolerance(tolerance: float | None, dtype: Any) -> float:
             remedy,
         )
     return float(tolerance)
+
+
+class _StaticCallable(eqx.Module):
+    """A plain function as a pytree without leaves."""
+
+    function: Callable = eqx.field(static=True)
+
+    def __call__(self, *arguments: Any) -> Any:
+        return self.function(*arguments)
+
+
+def as_callable(name: str, value: Any) -> Any:
+    """A callable as a pytree: modules and `jax.tree_util.Partial` with their leaves, plain functions without any."""
+    if not callable(value):
+        raise fail(name, type(value).__name__, "be callable", "Pass a function; swept numbers go in an eqx.Module.")
+    if isinstance(value, eqx.Module | jax.tree_util.Partial):
+        return value
+    return _StaticCallable(value)

@@ -1,18 +1,26 @@
 """Linear algebra shared by several rooms: thin calls to JAX, no algorithms of our own."""
 
+from typing import Any
+
+import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 
-def along_time(array: Array, inner_ndim: int, length: int) -> Array:
-    """`array` with a leading time axis: broadcast if constant, as it is if it has one already."""
+def along_time(array: Any, inner_ndim: int, length: int) -> Any:
+    """`array` (or `Diagonal`) with a leading time axis: broadcast if constant, as it is if it has one already."""
     if array.ndim == inner_ndim:
+        if isinstance(array, Diagonal):
+            return Diagonal(jnp.broadcast_to(array.values, (length, *array.values.shape)))
         return jnp.broadcast_to(array, (length, *array.shape))
     return array
 
 
-def transpose(matrix: Array) -> Array:
+def transpose(matrix: Any) -> Any:
     """Transpose of the last two axes."""
+    if isinstance(matrix, Diagonal):
+        return matrix
     return jnp.swapaxes(matrix, -1, -2)
 
 
@@ -27,15 +35,75 @@ def psd_factor(matrix: Float[Array, "*batch n n"]) -> Float[Array, "*batch n n"]
     return vectors * jnp.sqrt(jnp.maximum(values, 0))[..., None, :]
 
 
-def matvec(matrix: Array, vector: Array) -> Array:
+def matvec(matrix: "Matrix", vector: Array) -> Array:
     """`matrix @ vector` as multiply-and-sum, which XLA fuses: faster than a library call for small sizes."""
+    if isinstance(matrix, Diagonal):
+        return matrix.values * vector
     if matrix.shape[-1] <= 32:
         return jnp.sum(matrix * vector[..., None, :], axis=-1)
     return jnp.einsum("...ij,...j->...i", matrix, vector)
 
 
-def rmatvec(matrix: Array, vector: Array) -> Array:
+def rmatvec(matrix: "Matrix", vector: Array) -> Array:
     """`matrix.T @ vector` as multiply-and-sum (see `matvec`)."""
+    if isinstance(matrix, Diagonal):
+        return matrix.values * vector
     if matrix.shape[-2] <= 32:
         return jnp.sum(matrix * vector[..., :, None], axis=-2)
     return jnp.einsum("...ij,...i->...j", matrix, vector)
+
+
+class Diagonal(eqx.Module):
+    """diag(values), with any leading axes: stands for a square matrix where products should cost O(n), not O(n²)."""
+
+    values: Array
+
+    @property
+    def ndim(self) -> int:
+        """As the dense matrix."""
+        return self.values.ndim + 1
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """As the dense matrix."""
+        return (*self.values.shape, self.values.shape[-1])
+
+    @property
+    def T(self) -> "Diagonal":
+        """Itself."""
+        return self
+
+    def dense(self) -> Array:
+        """The matrix."""
+        return self.values[..., None] * jnp.eye(self.values.shape[-1], dtype=self.values.dtype)
+
+    def __array__(self, dtype: Any = None, copy: Any = None) -> np.ndarray:
+        return np.asarray(self.dense(), dtype)
+
+    def __add__(self, other: Any) -> Any:
+        if isinstance(other, Diagonal):
+            return Diagonal(self.values + other.values)
+        return self.dense() + other
+
+    __radd__ = __add__
+
+    def __matmul__(self, other: Any) -> Any:
+        if isinstance(other, Diagonal):
+            return Diagonal(self.values * other.values)
+        return self.values[..., None] * other
+
+    def __rmatmul__(self, other: Any) -> Any:
+        return other * self.values[..., None, :]
+
+
+Matrix = Array | Diagonal
+
+
+def as_dense(matrix: Matrix) -> Array:
+    """The matrix as an array."""
+    return matrix.dense() if isinstance(matrix, Diagonal) else matrix
+
+
+def congruence(F: Matrix, X: Array) -> Array:
+    """Fᵀ X F."""
+    return transpose(F) @ X @ F

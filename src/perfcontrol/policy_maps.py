@@ -1,4 +1,7 @@
-"""How a quantity depends on the policy: an affine map with known Lipschitz constant, or any function."""
+"""How a quantity depends on the policy: an affine map with known Lipschitz constant, or any function.
+
+Most maps give an array; one that says how the noise reacts gives the law of a random vector.
+"""
 
 import abc
 from collections.abc import Callable
@@ -13,10 +16,10 @@ from perfcontrol._checks import as_array, fail
 
 
 class AbstractPolicyMap(eqx.Module):
-    """M -> an array, where M is the lifted policy (memory, input, state)."""
+    """M -> an array (or a law, for noise), where M is the lifted policy (memory, input, state)."""
 
     @abc.abstractmethod
-    def __call__(self, M: Array) -> Array:
+    def __call__(self, M: Array) -> Any:
         """The value at the policy M."""
 
 
@@ -61,7 +64,7 @@ class Function(AbstractPolicyMap):
         self.f = f
         self.params = None if params is None else jax.tree.map(lambda leaf: as_array("params", leaf), params)
 
-    def __call__(self, M: Array) -> Array:
+    def __call__(self, M: Array) -> Any:
         return self.f(M) if self.params is None else self.f(M, self.params)
 
 

@@ -1,5 +1,6 @@
 """The performative control problem: everything that the world is, checked together once."""
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -8,10 +9,19 @@ import jax.core
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from perfcontrol._checks import as_array, check_integer, check_shape, check_time_varying, fail
-from perfcontrol._linalg import along_time
+from perfcontrol._checks import (
+    InputError,
+    as_array,
+    check_integer,
+    check_shape,
+    check_time_varying,
+    fail,
+    is_concrete,
+)
+from perfcontrol._linalg import Matrix, along_time
 from perfcontrol.costs import AbstractCost
 from perfcontrol.perturbations import AbstractPerturbation, NoPerturbation
+from perfcontrol.policy_maps import AbstractPolicyMap, as_policy_map
 from perfcontrol.random_vectors import AbstractRandomVector, Constant, Sequence
 from perfcontrol.sets import AbstractSet, AbstractStructure, FullStructure, LiftedSet, Unconstrained
 from perfcontrol.systems import LinearSystem
@@ -26,7 +36,8 @@ class PerformativeProblem(eqx.Module):
     Args:
         system: A_t and B_t.
         horizon: T ≥ 1; stages t = 0..T are summed, the terminal one included.
-        noise: law of w_t, dimension n.
+        noise: law of w_t, dimension n; or a policy map (a callable, `pc.Function`) from the lifted deployed policy to
+            such a law.
         cost: the stage cost.
         memory: H, 1 ≤ H < T.
         gain: K, (m, n) or (T+1, m, n); 0 for none. Sign: u = -K x.
@@ -43,7 +54,7 @@ class PerformativeProblem(eqx.Module):
     """
 
     system: LinearSystem
-    noise: AbstractRandomVector
+    noise: AbstractRandomVector | AbstractPolicyMap
     cost: AbstractCost
     gain: Array
     perturbation: AbstractPerturbation
@@ -52,13 +63,14 @@ class PerformativeProblem(eqx.Module):
     structure: AbstractStructure
     horizon: int = eqx.field(static=True)
     memory: int = eqx.field(static=True)
+    has_gain: bool = eqx.field(static=True)  # False: K = 0 for certain, and no product with it is computed
 
     def __init__(
         self,
         *,
         system: LinearSystem,
         horizon: int,
-        noise: AbstractRandomVector,
+        noise: AbstractRandomVector | Callable[[Array], AbstractRandomVector],
         cost: AbstractCost,
         memory: int = 1,
         gain: Any = 0,
@@ -104,7 +116,8 @@ class PerformativeProblem(eqx.Module):
                 f"match the {system.horizon} time steps of the system",
                 "A_t and B_t are given for t = 0..horizon-1.",
             )
-        self.noise = self._law("noise", noise, n)
+        reacting_noise = callable(noise) and not isinstance(noise, AbstractRandomVector)
+        self.noise = as_policy_map("noise", noise) if reacting_noise else self._law("noise", noise, n)
         if isinstance(initial_state, Sequence):
             raise fail("initial_state", "a Sequence", "be one random vector", "Pass an array (n,) or another law.")
         self.initial_state = self._law(
@@ -112,14 +125,20 @@ class PerformativeProblem(eqx.Module):
             initial_state if isinstance(initial_state, AbstractRandomVector) else Constant(initial_state),
             n,
         )
+        self.has_gain = not (isinstance(gain, int | float) and gain == 0)
+        if self.initial_state.mean.ndim == 2:
+            raise fail("initial_state", "a law that varies in time", "be one random vector", "Pass one vector (n,).")
         gain_array = as_array("gain", gain)
         if gain_array.ndim == 0:
             gain_array = jnp.broadcast_to(gain_array, (m, n)) if m == n == 1 else _zero_gain(gain_array, m, n)
         check_time_varying("gain", gain_array, (m, n), ("m", "n"), self.horizon + 1, "T+1")
         self.gain = gain_array
         self.cost.check(n, m, self.horizon)
+        self.perturbation = self.perturbation.resize(self.lifted_shape, self.horizon)
         self.perturbation.check(self.lifted_shape, self.horizon)
         self.feasible_set.check(self.policy_shape)
+        if reacting_noise:
+            self._check_reacting_noise()
 
     def _law(self, name: str, law: Any, size: int) -> AbstractRandomVector:
         law = _instance(name, law, AbstractRandomVector, "Pass for example pc.Gaussian(mean, covariance).")
@@ -134,6 +153,39 @@ class PerformativeProblem(eqx.Module):
                 "One row for each t = 0..horizon-1.",
             )
         return law
+
+    def _check_reacting_noise(self) -> None:
+        """Build the noise law once at a feasible policy, where values are known, else look at shapes alone."""
+        policy = jax.ShapeDtypeStruct(self.lifted_shape, self.dtype)
+
+        def moments(M: Array) -> tuple[Array, Array]:
+            law = self._law("noise", self.noise(M), self.state_size)  # type: ignore[operator]
+            return law.mean, law.covariance
+
+        try:
+            jax.eval_shape(moments, policy)
+            if is_concrete(self.system.A):
+                moments(self.structure.lift(self.initial_policy()))
+        except InputError:
+            raise
+        except (TypeError, ValueError) as error:
+            raise fail(
+                "noise",
+                f"an error from the policy map ({error})",
+                f"accept a policy of shape {self.lifted_shape} and return a law",
+                "Policy maps receive the lifted policy (memory, input, state).",
+            ) from error
+
+    def noise_under(self, deployed: Array) -> AbstractRandomVector:
+        """The law of w_t in the world that reacts to the lifted policy `deployed`."""
+        if isinstance(self.noise, AbstractRandomVector):
+            return self.noise
+        return self.noise(deployed).resize(self.state_size)
+
+    @property
+    def noise_reacts(self) -> bool:
+        """Whether the law of the noise depends on the deployed policy."""
+        return not isinstance(self.noise, AbstractRandomVector)
 
     @property
     def state_size(self) -> int:
@@ -180,6 +232,21 @@ class PerformativeProblem(eqx.Module):
     def initial_policy(self) -> Array:
         """The feasible policy nearest to zero: where solvers start when told nothing."""
         return self.feasible_set.project(jnp.zeros(self.policy_shape, self.dtype))
+
+    def closed_loop(self, A: Matrix, B: Matrix) -> Matrix:
+        """A - B K for t = 0..T-1, constant where all three are."""
+        if not self.has_gain:
+            return A
+        gain = self.gain if self.gain.ndim == 2 else self.gain[:-1]
+        return A + -(B @ gain)
+
+    def feedback(self, x: Array) -> Array:
+        """K_t x_t for t = 0..T, (T+1, m)."""
+        return x @ self.gain.T if self.gain.ndim == 2 else jnp.einsum("tmn,tn->tm", self.gain, x)
+
+    def feedback_adjoint(self, u: Array) -> Array:
+        """K_tᵀ u_t for t = 0..T, (T+1, n)."""
+        return u @ self.gain if self.gain.ndim == 2 else jnp.einsum("tmn,tm->tn", self.gain, u)
 
     def gains(self) -> Array:
         """K_t for t = 0..T, shape (T+1, m, n)."""

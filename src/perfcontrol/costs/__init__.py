@@ -1,6 +1,7 @@
 """Stage costs."""
 
 from perfcontrol.costs.base import AbstractCost
+from perfcontrol.costs.convex import ConvexCost
 from perfcontrol.costs.quadratic import QuadraticCost
 
-__all__ = ["AbstractCost", "QuadraticCost"]
+__all__ = ["AbstractCost", "ConvexCost", "QuadraticCost"]

@@ -64,7 +64,12 @@ class QuadraticCost(AbstractCost):
                     f"have shape (n, m) = ({n}, {m})",
                     swapped or "Rows: states.",
                 )
-            length = max(w.shape[0] if w.ndim == 3 else 1 for w in (self.Q, self.R, self.cross))
+            weights = {"Q": self.Q, "R": self.R, "cross": self.cross}
+            length = max(w.shape[0] if w.ndim == 3 else 1 for w in weights.values())
+            for name, w in weights.items():
+                if w.ndim == 3 and w.shape[0] != length:
+                    required = f"have as many time steps as the other weights: {length}"
+                    raise fail(name, f"{w.shape[0]}", required, "Give one weight per stage t = 0..T, or a constant.")
             check_symmetric_psd(
                 "cross",
                 self._joint(length),

@@ -14,8 +14,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from perfcontrol._checks import check_integer, check_key
-from perfcontrol._linalg import along_time, rmatvec
-from perfcontrol.evaluate.rollout import BATCH, Path, Trajectories, check_pair, closed_loop, sample_path
+from perfcontrol._linalg import rmatvec
+from perfcontrol.evaluate.rollout import BATCH, Path, Trajectories, check_pair, input_adjoint, input_term, sample_path
 from perfcontrol.policy import feedforward_adjoint
 from perfcontrol.problem import PerformativeProblem
 
@@ -39,13 +39,13 @@ def path_gradient(problem: PerformativeProblem, path: Path | Trajectories) -> Ar
             return path_gradient(problem, Path(single.x, single.u, single.w, single.draws))
 
         return jnp.mean(jax.vmap(one)(path), axis=0)
-    system, gain = problem.system, problem.gain
+    system = problem.system
     n, m = problem.state_size, problem.input_size
     acts_on_input = problem.perturbation.columns(n, m) > n
     by_state, by_input = problem.cost.path_gradients(path.x, path.u)
-    gains = along_time(gain, 2, problem.horizon + 1)
-    source = by_state - (by_input @ gain if gain.ndim == 2 else jnp.einsum("tmn,tm->tn", gain, by_input))
-    loop = closed_loop(system, gain)
+    gains = problem.gains()
+    source = by_state - problem.feedback_adjoint(by_input) if problem.has_gain else by_state
+    loop = problem.closed_loop(system.A, system.B)
     varying = loop.ndim == 3
 
     def retreat(y: Array, step: Any) -> tuple[Array, tuple[Array, Array | None]]:
@@ -58,7 +58,7 @@ def path_gradient(problem: PerformativeProblem, path: Path | Trajectories) -> Ar
 
     steps = (source[:-1], path.draws.steps, loop if varying else None, gains[:-1] if acts_on_input else None)
     _, (following, on_input) = jax.lax.scan(retreat, source[-1], steps, reverse=True)
-    by_v = following @ system.B if system.B.ndim == 2 else jnp.einsum("tnm,tn->tm", system.B, following)
+    by_v = input_adjoint(system.B, following)
     if on_input is not None:
         by_v = by_v + on_input
     h = by_input.at[:-1].add(by_v)
@@ -69,8 +69,7 @@ def recover_noise(
     problem: PerformativeProblem, x: Float[Array, "T1 n"], u: Float[Array, "T1 m"], A: Float[Array, "T n n"]
 ) -> Float[Array, "T n"]:
     """w_t = x_{t+1} - A_t x_t - B_t u_t from an observed path, A_t being the perturbed state matrix (Algorithm 1)."""
-    B = along_time(problem.system.B, 2, problem.horizon)
-    return x[1:] - jnp.einsum("tij,tj->ti", A, x[:-1]) - jnp.einsum("tij,tj->ti", B, u[:-1])
+    return x[1:] - jnp.einsum("tij,tj->ti", A, x[:-1]) - input_term(problem.system.B, u)
 
 
 def mean_path_gradient(

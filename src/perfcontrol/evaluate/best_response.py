@@ -59,9 +59,9 @@ class Quadratic(NamedTuple):
     matrix: Array | None  # (p, p) where held
 
 
-def _stationary(problem: PerformativeProblem) -> bool:
+def _stationary(world: CostToGo) -> bool:
     """Whether noise mean and covariance are constant in time (known from shapes)."""
-    return problem.noise.mean.ndim == 1 and problem.noise.covariance.ndim == 2
+    return world.noise_mean.ndim == 1 and world.noise_covariance.ndim == 2
 
 
 def _gradient_at(problem: PerformativeProblem, world: CostToGo) -> Operator:
@@ -100,12 +100,12 @@ def quadratic(problem: PerformativeProblem, world: CostToGo) -> Quadratic:
 def _hessian_matrix(problem: PerformativeProblem, world: CostToGo, gradient: Operator, linear: Array) -> Array:
     """The Hessian in the free parameters (p, p)."""
     size = linear.size
-    if _stationary(problem):
+    if _stationary(world):
         H, m, _ = problem.lifted_shape
-        w = problem.noise.mean
+        w = world.noise_mean
         G = impulse_form(world, H).G
         blocks = jnp.stack([G, _constant_mean_form(problem, world)]).reshape(2, H, m, H, m)
-        right = jnp.stack([problem.noise.covariance, jnp.outer(w, w)])
+        right = jnp.stack([world.noise_covariance, jnp.outer(w, w)])
 
         def column(direction: Array) -> Array:
             V = problem.structure.lift(direction.reshape(linear.shape))
@@ -198,6 +198,7 @@ class _Affine:
             inverse = P @ inverse @ P
             dimension = jnp.round(jnp.trace(P))
         self.unique = rank >= dimension
+        self.inverse = inverse
         self.solve = lambda gradient: -(inverse @ gradient.reshape(-1)).reshape(shape)
 
     def _conjugate_gradients(self, tangent: Operator) -> Operator:
@@ -323,7 +324,7 @@ class _Separable:
         self.problem, self.world = problem, world
         H, m, n = self.shape = problem.lifted_shape
         G, G_mean = impulse_form(world, H).G, _constant_mean_form(problem, world)
-        Sigma, w = problem.noise.covariance, problem.noise.mean
+        Sigma, w = world.noise_covariance, world.noise_mean
         eps = jnp.finfo(G.dtype).eps
         G_values, self.G_vectors = jnp.linalg.eigh(G)
         S_values, S_vectors = jnp.linalg.eigh(Sigma)
@@ -358,13 +359,23 @@ class _Separable:
         return jax.lax.cond(self.regular, closed, dense, start)
 
     def newton(self, M: Array) -> Operator:
-        return lambda gradient: jnp.where(self.regular, self.solve(gradient), 0)
+        def dense() -> _Affine:
+            return _Affine(self.problem, quadratic(self.problem, self.world))
+
+        if M.size > DENSE_LIMIT:
+            return lambda gradient: jax.lax.cond(self.regular, self.solve, lambda g: dense().solve(g), gradient)
+        size, dtype = M.size, M.dtype
+        # Worked out once, and only where it is needed.
+        inverse = jax.lax.cond(self.regular, lambda: jnp.zeros((size, size), dtype), lambda: dense().inverse)
+        return lambda gradient: jnp.where(
+            self.regular, self.solve(gradient), -(inverse @ gradient.reshape(-1)).reshape(gradient.shape)
+        )
 
 
 def _method(problem: PerformativeProblem, world: CostToGo) -> _Affine | _Projected | _Separable:
     """The cheapest method that is exact for this kind of problem; known from types and shapes alone."""
     unconstrained = isinstance(problem.feasible_set, Unconstrained)
-    if unconstrained and isinstance(problem.structure, FullStructure) and _stationary(problem):
+    if unconstrained and isinstance(problem.structure, FullStructure) and _stationary(world):
         return _Separable(problem, world)
     form = quadratic(problem, world)
     return _Affine(problem, form) if problem.feasible_set.affine else _Projected(problem, form)

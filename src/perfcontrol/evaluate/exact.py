@@ -18,9 +18,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from perfcontrol._checks import fail
-from perfcontrol._linalg import along_time, matvec, rmatvec, symmetrise, transpose
+from perfcontrol._linalg import Matrix, along_time, as_dense, congruence, matvec, rmatvec, symmetrise, transpose
 from perfcontrol.costs import QuadraticCost
-from perfcontrol.evaluate.rollout import check_pair
+from perfcontrol.evaluate.rollout import check_pair, input_adjoint, input_term
 from perfcontrol.policy import feedforward, feedforward_adjoint
 from perfcontrol.problem import PerformativeProblem
 
@@ -29,14 +29,17 @@ class CostToGo(eqx.Module):
     """What the deployed policy makes of the world; none of it depends on the evaluated policy.
 
     Lambda: (T+1, n, n) cost-to-go. S: (T+1, m, m) curvature in the feedforward v_t. D: (T+1, m, n) its coupling to
-    the state. F: (T, n, n) mean closed loop. B: (T, n, m) mean input matrix, Θ included.
+    the state. F: (T, n, n) mean closed loop. B: (T, n, m) mean input matrix, Θ included. noise_mean: (n,) or (T, n) and
+    noise_covariance: (n, n) or (T, n, n), of the law of w_t.
     """
 
     Lambda: Float[Array, "T1 n n"]
     S: Float[Array, "T1 m m"]
     D: Float[Array, "T1 m n"]
-    F: Float[Array, "T n n"]
-    B: Float[Array, "T n m"]
+    F: Matrix
+    B: Matrix
+    noise_mean: Float[Array, "*time n"]
+    noise_covariance: Float[Array, "*times n n"]
 
 
 class ImpulseForm(eqx.Module):
@@ -70,78 +73,111 @@ def mean_dynamics(problem: PerformativeProblem, reacting: Array) -> tuple[Array,
     n, m, T = problem.state_size, problem.input_size, problem.horizon
     Theta = problem.perturbation.mean(reacting, T)
     assert Theta is not None
-    joint = jnp.concatenate([along_time(problem.system.A, 2, T), along_time(problem.system.B, 2, T)], axis=-1)
+    A, B = as_dense(problem.system.A), as_dense(problem.system.B)
+    joint = jnp.concatenate([along_time(A, 2, T), along_time(B, 2, T)], axis=-1)
     joint = joint.at[..., : Theta.shape[-1]].add(Theta)
     eye = jnp.eye(n + m, dtype=joint.dtype)
     return joint, jnp.broadcast_to(eye, (T + 1, n + m, n + m)).at[:, n:, :n].set(-problem.gains())
 
 
+def _stage_weights(problem: PerformativeProblem) -> tuple[Array, Array, Array]:
+    """The stage weight seen through u = v - K x: on x, (n, n); between v and x, (m, n); on v, (m, m).
+
+    Each with a leading axis T+1 where it varies in time.
+    """
+    cost = problem.cost
+    assert isinstance(cost, QuadraticCost)
+    Q, R, cross = cost.Q, cost.R, cost.cross
+    between = jnp.zeros((problem.input_size, problem.state_size), Q.dtype) if cross is None else transpose(cross)
+    if not problem.has_gain:
+        return Q, between, R
+    K = problem.gain
+    mixed = transpose(K) @ between
+    return Q + transpose(K) @ R @ K - mixed - transpose(mixed), between - R @ K, R
+
+
 def cost_to_go(problem: PerformativeProblem, reacting: Array) -> CostToGo:
     """The backward recursion under the lifted deployed policy `reacting`."""
-    n, T = problem.state_size, problem.horizon
-    weights = problem.cost.form(T).matrix  # type: ignore[attr-defined]
-    joint, through_gain = mean_dynamics(problem, reacting)
-    stage = transpose(through_gain) @ weights @ through_gain
-    closed = joint @ through_gain[:-1]  # [F_t, B_t]
-    F, B = closed[..., :n], closed[..., n:]
+    n, m, T = problem.state_size, problem.input_size, problem.horizon
+    on_x, between, on_v = _stage_weights(problem)
+    A, B = problem.system.A, problem.system.B
+    on_input = problem.perturbation.columns(n, m) > n
+    Theta = problem.perturbation.mean_operator(reacting, T)
+    if Theta is not None and on_input:
+        joint = as_dense(Theta)
+        A, B = A + joint[..., :n], B + joint[..., n:]
+    elif Theta is not None:
+        A = A + Theta
+    F, B = along_time(problem.closed_loop(A, B), 2, T), along_time(B, 2, T)
     spread = problem.perturbation.covariance(reacting, T)
     assert spread is not None
-    on_input = problem.perturbation.columns(n, problem.input_size) > n
-    state_part = through_gain[:-1, :, :n]
+    K = problem.gains()[:-1]
+    state_part = jnp.concatenate([jnp.broadcast_to(jnp.eye(n, dtype=K.dtype), (T, n, n)), -K], axis=1)
 
     def retreat(Lambda: Array, step: Any) -> tuple[Array, Array]:
         F_t, stage_t, spread_t, state_part_t = step
         reaction = spread.adjoint_step(spread_t, Lambda)
         if on_input:
-            reaction = state_part_t.T @ reaction @ state_part_t
-        previous = symmetrise(stage_t + F_t.T @ Lambda @ F_t + reaction)
+            reaction = congruence(state_part_t, reaction)
+        previous = (on_x if stage_t is None else stage_t) + congruence(F_t, Lambda) + reaction
         return previous, previous
 
-    steps = (F, stage[:-1, :n, :n], spread.steps, state_part if on_input else None)
-    _, earlier = jax.lax.scan(retreat, stage[-1, :n, :n], steps, reverse=True)
-    Lambda = jnp.concatenate([earlier, stage[-1:, :n, :n]])
+    last = symmetrise(on_x if on_x.ndim == 2 else on_x[-1])
+    steps = (F, on_x[:-1] if on_x.ndim == 3 else None, spread.steps, state_part if on_input else None)
+    _, earlier = jax.lax.scan(retreat, last, steps, reverse=True)
+    Lambda = jnp.concatenate([earlier, last[None]])
     # What couples to v needs no recursion: in bulk over time.
     pulled = transpose(B) @ Lambda[1:]
-    S = stage[:, n:, n:].at[:-1].add(symmetrise(pulled @ B))
-    D = stage[:, n:, :n].at[:-1].add(pulled @ F)
+    S, D = pulled @ B, pulled @ F
     if on_input:
         reaction = spread.adjoint(Lambda[1:])
-        S = S.at[:-1].add(reaction[:, n:, n:])
-        D = D.at[:-1].add(reaction[:, n:, :] @ state_part)
-    return CostToGo(Lambda, S, D, F, B)
+        S, D = S + reaction[:, n:, n:], D + reaction[:, n:, :] @ state_part
+
+    def with_stage(stage: Array, moved: Array) -> Array:
+        stage = along_time(stage, 2, T + 1)
+        return jnp.concatenate([stage[:-1] + moved, stage[-1:]])
+
+    S, D = with_stage(on_v, S), with_stage(between, D)
+    noise = problem.noise_under(reacting)
+    return CostToGo(Lambda, S, D, F, B, noise.mean, noise.covariance)
 
 
-def _chains(world: CostToGo, memory: int) -> tuple[Array, Array]:
+def _chains(world: CostToGo, memory: int) -> tuple[list[Array], list[Array]]:
     """Y[d]_t = D_t F_{t-1} ⋯ F_{t-d}, (H, T+1, m, n), and X[d]_t, the block coupling lags j and j-d at t = s+j.
 
     X[0] = S and X[d] = Y[d-1]_t B_{t-d}, (H, T+1, m, m); zero where t < d.
     """
-    T = world.F.shape[0]
+    length = world.S.shape[0]
 
-    def shifted(array: Array, d: int) -> Array:
-        """array_{t-d} for t = 0..T, zero where t < d."""
-        pad = jnp.zeros((d, *array.shape[1:]), array.dtype)
-        return jnp.concatenate([pad, array])[: T + 1]
+    def shifted(matrices: Matrix, d: int) -> Matrix:
+        """matrices_{t-d} for t = 0..T, zero where t < d."""
+
+        def shift(array: Array) -> Array:
+            return jnp.concatenate([jnp.zeros((d, *array.shape[1:]), array.dtype), array])[:length]
+
+        return jax.tree.map(shift, matrices)
 
     Y, X = [world.D], [world.S]
     for d in range(1, memory):
         X.append(Y[-1] @ shifted(world.B, d))
         Y.append(Y[-1] @ shifted(world.F, d))
-    return jnp.stack(Y), jnp.stack(X)
+    return Y, X
 
 
 def impulse_form(world: CostToGo, memory: int) -> ImpulseForm:
     """The blocks summed over impulses, by suffix sums over time."""
-    m, n = world.D.shape[1:]
+    m = world.S.shape[-1]
     Y, X = _chains(world, memory)
-    later = jnp.flip(jnp.cumsum(jnp.flip(X, axis=1), axis=1), axis=1)  # Σ_{t ≥ j} X[d]_t at index [d, j]
+    # Σ_{t ≥ j} X[d]_t at index [d, j], for j = 0..memory
+    head = jnp.stack([jnp.concatenate([x[:memory], jnp.sum(x[memory:], axis=0)[None]]) for x in X])
+    later = jnp.flip(jnp.cumsum(jnp.flip(head, axis=1), axis=1), axis=1)
     row, column = jnp.meshgrid(jnp.arange(memory), jnp.arange(memory), indexing="ij")
     blocks = later[jnp.abs(row - column), jnp.maximum(row, column) + 1]
     blocks = jnp.where((row >= column)[..., None, None], blocks, transpose(blocks))
     G = blocks.transpose(0, 2, 1, 3).reshape(memory * m, memory * m)
-    F = jnp.sum(Y, axis=1)  # Y[d]_t is zero for t < d ...
-    F = F - Y[jnp.arange(memory), jnp.arange(memory)]  # ... and t = d would be the impulse w_{-1}
-    return ImpulseForm(G, F.reshape(memory * m, n), jnp.sum(world.Lambda[1:], axis=0))
+    # Y[d]_t is zero for t < d, and t = d would be the impulse w_{-1}.
+    F = jnp.concatenate([jnp.sum(y[d + 1 :], axis=0) for d, y in enumerate(Y)])
+    return ImpulseForm(G, F, jnp.sum(world.Lambda[1:], axis=0))
 
 
 def _varying_impulses(world: CostToGo, M: Array, covariance: Array) -> tuple[Array, Array]:
@@ -188,10 +224,11 @@ def mean_path(
     n, T = problem.state_size, problem.horizon
     form = problem.cost.form(T)  # type: ignore[attr-defined]
     linear, constant = (form.linear, form.constant) if targets else (form.linear * 0, form.constant * 0)
-    gains = problem.gains()
     moved = jnp.einsum("tij,tj->ti", world.Lambda[1:], w)  # Λ_{t+1} w_t
     by_input_stage = linear[:, n:]
-    by_state_stage = linear[:, :n] - jnp.einsum("tmn,tm->tn", gains, by_input_stage)
+    by_state_stage = linear[:, :n]
+    if problem.has_gain:
+        by_state_stage = by_state_stage - problem.feedback_adjoint(by_input_stage)
     source = by_state_stage + jnp.einsum("tmn,tm->tn", world.D, v)
 
     def retreat(p: Array, step: Any) -> tuple[Array, Array]:
@@ -204,11 +241,11 @@ def mean_path(
         F_t, push_t = step
         return matvec(F_t, mu) + push_t, mu
 
-    push = jnp.einsum("tnm,tm->tn", world.B, v[:-1]) + w
+    push = input_term(world.B, v) + w
     last, earlier = jax.lax.scan(advance, x0, (world.F, push))
     mu = jnp.concatenate([earlier, last[None]])
     Sv = jnp.einsum("tij,tj->ti", world.S, v)
-    half = by_input_stage.at[:-1].add(jnp.einsum("tnm,tn->tm", world.B, moved + p_next))
+    half = by_input_stage.at[:-1].add(input_adjoint(world.B, moved + p_next))
     cost = jnp.sum(v * (Sv + 2 * half)) + jnp.sum(w * (moved + 2 * p_next)) + jnp.sum(constant)
     cost = cost + x0 @ (world.Lambda[0] @ x0 + 2 * p0)
     return cost, 2 * (jnp.einsum("tmn,tn->tm", world.D, mu) + Sv + half)
@@ -216,7 +253,7 @@ def mean_path(
 
 def cost_and_gradient(problem: PerformativeProblem, world: CostToGo, policy: Array) -> tuple[Array, Array]:
     """C_T and ∇_1 C_T at a lifted policy, given the world that the deployed policy makes."""
-    covariance, mean = problem.noise.covariance, problem.noise.mean
+    covariance, mean = world.noise_covariance, world.noise_mean
     impulses = _constant_impulses if covariance.ndim == 2 else _varying_impulses
     cost, gradient = impulses(world, policy, covariance)
     w = along_time(mean, 1, problem.horizon)

@@ -41,8 +41,9 @@ def moments_of(problem: PerformativeProblem, policy: Array, reacting: Array) -> 
     spread = problem.perturbation.covariance(reacting, T)
     assert spread is not None
     columns = problem.perturbation.columns(n, m)
-    w = along_time(problem.noise.mean, 1, T)
-    covariance = along_time(problem.noise.covariance, 2, T)
+    noise = problem.noise_under(reacting)
+    w = along_time(noise.mean, 1, T)
+    covariance = along_time(noise.covariance, 2, T)
     second_w = covariance + w[:, :, None] * w[:, None, :]
     past = lagged(w, H)  # (T+1, H, n): means of w_{t-i}
     # E[w_{t-i} w_{t-j}ᵀ], (T+1, H, H, n, n): the mean product, plus the covariance where the lags agree

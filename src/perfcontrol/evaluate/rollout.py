@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from perfcontrol._checks import check_integer, check_key
-from perfcontrol._linalg import along_time, matvec
+from perfcontrol._linalg import Diagonal, Matrix, along_time, matvec
 from perfcontrol.perturbations import Draws
 from perfcontrol.policy import feedforward
 from perfcontrol.problem import PerformativeProblem
@@ -50,28 +50,25 @@ class Estimate(eqx.Module):
     standard_error: Float[Array, "..."]
 
 
-def closed_loop(system: Any, gain: Array) -> Array:
-    """A - B K, constant if all three are, else (T, n, n)."""
-    if gain.ndim == 3:
-        gain = gain[:-1]
-    return system.A - system.B @ gain
-
-
-def input_term(B: Array, v: Float[Array, "T1 m"]) -> Float[Array, "T n"]:
+def input_term(B: Matrix, v: Float[Array, "T1 m"]) -> Float[Array, "T n"]:
     """B_t v_t for t = 0..T-1."""
+    if isinstance(B, Diagonal):
+        return B.values * v[:-1]
     return v[:-1] @ B.T if B.ndim == 2 else jnp.einsum("tnm,tm->tn", B, v[:-1])
 
 
-def feedback(gain: Array, x: Float[Array, "T1 n"]) -> Float[Array, "T1 m"]:
-    """K_t x_t for t = 0..T."""
-    return x @ gain.T if gain.ndim == 2 else jnp.einsum("tmn,tn->tm", gain, x)
+def input_adjoint(B: Matrix, y: Float[Array, "T n"]) -> Float[Array, "T m"]:
+    """B_tᵀ y_t for t = 0..T-1."""
+    if isinstance(B, Diagonal):
+        return B.values * y
+    return y @ B if B.ndim == 2 else jnp.einsum("tnm,tn->tm", B, y)
 
 
 def sample_path(problem: PerformativeProblem, policy: Array, deployed: Array, key: Key[Array, ""]) -> Path:
     """One path; `policy` and `deployed` are lifted."""
     initial_key, noise_key, perturbation_key = jax.random.split(key, 3)
     x0 = problem.initial_state.sample(initial_key, 1)[0].astype(policy.dtype)
-    w = problem.noise.sample(noise_key, problem.horizon).astype(policy.dtype)
+    w = problem.noise_under(deployed).sample(noise_key, problem.horizon).astype(policy.dtype)
     draws = problem.perturbation.sample(perturbation_key, deployed, problem.horizon)
     return run_path(problem, policy, x0, w, draws)
 
@@ -83,7 +80,7 @@ def run_path(problem: PerformativeProblem, policy: Array, x0: Array, w: Array, d
     acts_on_input = problem.perturbation.columns(n, m) > n
     v = feedforward(policy, w)
     offset = input_term(system.B, v) + w
-    loop = closed_loop(system, gain)
+    loop = problem.closed_loop(system.A, system.B)
     varying = loop.ndim == 3
 
     def advance(x: Array, step: Any) -> tuple[Array, Array]:
@@ -98,7 +95,7 @@ def run_path(problem: PerformativeProblem, policy: Array, x0: Array, w: Array, d
     u_part = (v[:-1], along_time(gain, 2, problem.horizon + 1)[:-1]) if acts_on_input else None
     _, states = jax.lax.scan(advance, x0, (offset, draws.steps, loop if varying else None, u_part))
     x = jnp.concatenate([x0[None], states])
-    return Path(x, v - feedback(gain, x), w, draws)
+    return Path(x, v - problem.feedback(x) if problem.has_gain else v, w, draws)
 
 
 @eqx.filter_jit

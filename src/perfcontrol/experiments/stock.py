@@ -5,7 +5,8 @@ What the paper leaves open is completed here, each with its reason:
   paper's figures come out.
 - growth ρ in A = ρ I: the paper prints A = I, and compares an almost surely stable, an unstable and a general
   regime without saying how they are made.
-- the volatility is read as log-normal: as printed it is clipped to -0.6 on every day, and nothing depends on the policy.
+- the volatility is read as log-normal: as printed it is clipped to -0.6 on every day, and nothing depends on the
+  policy.
 """
 
 from typing import Any, Literal
@@ -85,7 +86,7 @@ def stock_market(
     shown = np.block([[eye, zero], [zero, zero]])  # only the first half of state and input is paid for
     unit_noise = Uniform(np.zeros(STOCKS), np.ones(STOCKS))
     return PerformativeProblem(
-        system=LinearSystem(growth * jnp.eye(2 * STOCKS), jnp.eye(2 * STOCKS)),
+        system=LinearSystem.diagonal(growth * jnp.ones(2 * STOCKS), jnp.ones(2 * STOCKS)),
         horizon=HORIZON,
         noise=Linear(unit_noise, np.vstack([eye, eye]), np.concatenate([-np.full(STOCKS, 0.5), np.zeros(STOCKS)])),
         cost=QuadraticCost(shown, shown),

@@ -12,6 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
+from perfcontrol._linalg import Matrix, matvec, rmatvec
+
 
 class Draws(eqx.Module):
     """One draw of Δ_0, ..., Δ_{T-1} as linear operators from R^p to R^n, p = n, or n+m for performative B."""
@@ -40,6 +42,25 @@ class Draws(eqx.Module):
     def rmatvec(self, y: Float[Array, "T n"]) -> Float[Array, "T p"]:
         """Δ_tᵀ y_t for every t."""
         return jax.vmap(self.rmatvec_step)(self.steps, y)
+
+
+class DenseDraws(Draws):
+    """Draws held as matrices."""
+
+    matrices: Float[Array, "T n p"]
+
+    @property
+    def steps(self) -> Any:
+        return self.matrices
+
+    def matvec_step(self, step: Any, z: Array) -> Array:
+        return matvec(step, z)
+
+    def rmatvec_step(self, step: Any, y: Array) -> Array:
+        return rmatvec(step, y)
+
+    def dense(self) -> Array:
+        return self.matrices
 
 
 class CovarianceOperator(eqx.Module):
@@ -94,9 +115,17 @@ class AbstractPerturbation(eqx.Module):
     def sensitivity(self, feasible_set: Any, horizon: int) -> Float[Array, " T"] | None:
         """ε_t ≥ W₁(D_t(M), D_t(M')) / ‖M - M'‖_F over the set, spectral norm as ground metric."""
 
+    def mean_operator(self, M: Array, horizon: int) -> Matrix | None:
+        """`mean` as the engines use it: None where it is zero for certain, a `Diagonal` where it is diagonal."""
+        return self.mean(M, horizon)
+
     def columns(self, state_size: int, input_size: int) -> int:
         """p: n if Δ acts on the state alone, n+m if on [x; u]."""
         return state_size
+
+    def resize(self, policy_shape: tuple[int, int, int], horizon: int) -> "AbstractPerturbation":
+        """This law with all its sizes known, where they follow from the problem's."""
+        return self
 
     def check(self, policy_shape: tuple[int, int, int], horizon: int) -> None:
         """Raise InputError where this law does not fit a problem of that shape; looks at shapes only."""

@@ -10,8 +10,9 @@ from jaxtyping import Array, Key
 from perfcontrol._checks import as_array, fail
 from perfcontrol._linalg import matvec, rmatvec
 from perfcontrol.perturbations.base import AbstractPerturbation, CovarianceOperator, Draws, zero_mean
+from perfcontrol.perturbations.dependence import check_values, largest_entries, matrix_slope_norm, slopes
 from perfcontrol.perturbations.scalar_laws import SCALAR_LAWS
-from perfcontrol.policy_maps import AbstractPolicyMap, Affine, as_policy_map, evaluate_map
+from perfcontrol.policy_maps import AbstractPolicyMap, as_policy_map, evaluate_map
 
 
 class _DirectionalDraws(Draws):
@@ -101,27 +102,10 @@ class DirectionalPerturbation(AbstractPerturbation):
                 f"have shape (k, n, n) = ({count}, {n}, {n}) or (k, n, n+m) = ({count}, {n}, {n + m})",
                 "n and m come from the system.",
             )
-        policy = jax.ShapeDtypeStruct(policy_shape, self.directions.dtype)
-        allowed = {"scale": [(horizon, count), (count,)], "mean": [(horizon, n, columns), (n, columns)]}
-        for name, policy_map in (("scale", self.scale), ("mean", self.mean_map)):
-            if policy_map is None:
-                continue
-            try:
-                shape = jax.eval_shape(evaluate_map, policy_map, policy).shape
-            except (TypeError, ValueError) as error:
-                raise fail(
-                    name,
-                    f"an error from the policy map ({error})",
-                    f"accept a policy of shape {policy_shape}",
-                    "Policy maps receive the lifted policy (memory, input, state).",
-                ) from error
-            if shape not in allowed[name]:
-                raise fail(
-                    name,
-                    f"values of shape {shape}",
-                    f"have values of shape {allowed[name][0]} or {allowed[name][1]}",
-                    "The time axis comes first.",
-                )
+        dtype = self.directions.dtype
+        check_values("scale", self.scale, policy_shape, [(horizon, count), (count,)], dtype)
+        if self.mean_map is not None:
+            check_values("mean", self.mean_map, policy_shape, [(horizon, n, columns), (n, columns)], dtype)
 
     def scales(self, M: Array, horizon: int) -> Array:
         """scale(M), shape (T, k)."""
@@ -138,6 +122,9 @@ class DirectionalPerturbation(AbstractPerturbation):
             return zero_mean(M, horizon, self.directions.shape[-1])
         return jnp.broadcast_to(evaluate_map(self.mean_map, M), (horizon, *self.directions.shape[1:]))
 
+    def mean_operator(self, M: Array, horizon: int) -> Array | None:
+        return None if self.mean_map is None else self.mean(M, horizon)
+
     def covariance(self, M: Array, horizon: int) -> CovarianceOperator:
         return _DirectionalCovariance(self.scales(M, horizon) ** 2, self.directions)
 
@@ -146,13 +133,13 @@ class DirectionalPerturbation(AbstractPerturbation):
 
     def bound(self, feasible_set: Any, horizon: int) -> Array | None:
         """Σ_k sup|scale_k| sup|ζ| ‖D_k‖ + sup‖mean‖; known for affine maps on a bounded set."""
-        scales = _largest_entries(self.scale, feasible_set)
+        scales = largest_entries(self.scale, feasible_set)
         if scales is None:
             return None
         norms = jnp.linalg.norm(self.directions, ord=2, axis=(-2, -1))
         total = SCALAR_LAWS[self.law].bound * jnp.sum(scales * norms, axis=-1)
         if self.mean_map is not None:
-            means = _largest_entries(self.mean_map, feasible_set)
+            means = largest_entries(self.mean_map, feasible_set)
             if means is None:
                 return None
             constant = not isinstance(self.mean_map, AbstractPolicyMap)
@@ -162,42 +149,17 @@ class DirectionalPerturbation(AbstractPerturbation):
 
     def sensitivity(self, feasible_set: Any, horizon: int) -> Array | None:
         """Σ_k ‖slope_k‖_F E|ζ| ‖D_k‖ + ‖mean slope‖: couples both laws by the same ζ; known for affine maps."""
-        slopes = _slopes(self.scale)
-        if slopes is None:
+        by_scale = slopes(self.scale)
+        if by_scale is None:
             return None
         norms = jnp.linalg.norm(self.directions, ord=2, axis=(-2, -1))
         per_direction = (
-            jnp.sqrt(jnp.sum(slopes**2, axis=(-3, -2, -1))) * norms if slopes.ndim else jnp.zeros_like(norms)
+            jnp.sqrt(jnp.sum(by_scale**2, axis=(-3, -2, -1))) * norms if by_scale.ndim else jnp.zeros_like(norms)
         )
         total = SCALAR_LAWS[self.law].mean_absolute * jnp.sum(per_direction, axis=-1)
-        if isinstance(self.mean_map, AbstractPolicyMap):
-            mean_slopes = _slopes(self.mean_map)
-            if mean_slopes is None:
+        if self.mean_map is not None:
+            by_mean = matrix_slope_norm(self.mean_map)
+            if by_mean is None:
                 return None
-            flat = mean_slopes.reshape(*mean_slopes.shape[:-5], -1, *mean_slopes.shape[-3:])
-            total = total + jnp.linalg.norm(flat.reshape(*flat.shape[:-3], -1), ord=2, axis=(-2, -1))
+            total = total + by_mean
         return jnp.broadcast_to(total, (horizon,))
-
-
-def _largest_entries(policy_map: AbstractPolicyMap | Array, feasible_set: Any) -> Array | None:
-    """sup over the set of |entries|; None where not known (a general function, an unbounded set)."""
-    if not isinstance(policy_map, AbstractPolicyMap):
-        return jnp.abs(policy_map)
-    if not isinstance(policy_map, Affine):
-        return None
-    flat = policy_map.slope.reshape(-1, *policy_map.slope.shape[-3:])
-    upper = feasible_set.support(flat)
-    lower = feasible_set.support(-flat)
-    if upper is None or lower is None:
-        return None
-    shape = policy_map.offset.shape
-    return jnp.maximum(
-        jnp.abs(policy_map.offset + upper.reshape(shape)), jnp.abs(policy_map.offset - lower.reshape(shape))
-    )
-
-
-def _slopes(policy_map: AbstractPolicyMap | Array) -> Array | None:
-    """The derivative of an affine map, a zero scalar for a constant, None for a general function."""
-    if not isinstance(policy_map, AbstractPolicyMap):
-        return jnp.zeros(())
-    return policy_map.slope if isinstance(policy_map, Affine) else None

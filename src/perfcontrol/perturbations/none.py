@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Key
 
@@ -11,7 +12,7 @@ from perfcontrol.perturbations.base import AbstractPerturbation, CovarianceOpera
 class _ZeroDraws(Draws):
     zeros: Array  # (T, 0): nothing to carry, but the horizon
 
-    size: int
+    size: int = eqx.field(static=True)
 
     @property
     def steps(self) -> Any:
@@ -49,6 +50,9 @@ class NoPerturbation(AbstractPerturbation):
 
     def mean(self, M: Array, horizon: int) -> Array:
         return zero_mean(M, horizon, M.shape[-1])
+
+    def mean_operator(self, M: Array, horizon: int) -> None:
+        return None
 
     def covariance(self, M: Array, horizon: int) -> CovarianceOperator:
         return _ZeroCovariance(jnp.zeros((horizon, 0), M.dtype))

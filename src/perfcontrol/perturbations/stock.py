@@ -20,6 +20,7 @@ from jaxtyping import Array, Key
 from scipy import special
 
 from perfcontrol._checks import as_array, check_shape, fail
+from perfcontrol._linalg import Diagonal
 from perfcontrol.perturbations.base import AbstractPerturbation, CovarianceOperator, Draws
 
 SPREAD = 0.2  # standard deviation of the Gaussian behind the volatility
@@ -165,8 +166,10 @@ class StockPerturbation(AbstractPerturbation):
         return _StockDraws(deviation, self._mean_growth(M) - 1)
 
     def mean(self, M: Array, horizon: int) -> Array:
-        diagonal = self._mean_growth(M) - 1
-        return jax.vmap(jnp.diag)(jnp.concatenate([diagonal, diagonal], axis=-1))
+        return self.mean_operator(M, horizon).dense()
+
+    def mean_operator(self, M: Array, horizon: int) -> Diagonal:
+        return Diagonal(jnp.tile(self._mean_growth(M) - 1, (1, 2)))
 
     def covariance(self, M: Array, horizon: int) -> CovarianceOperator:
         portfolio = self.portfolio(M)
@@ -177,8 +180,8 @@ class StockPerturbation(AbstractPerturbation):
         if feasible_set.radius is None:
             return None
         lowest, highest = self._growth_range(horizon)
-        # ‖row of the portfolio‖₁ ≤ 1 on the simplex; elsewhere at most √L times the radius over the exposure
-        if feasible_set.row_total is not None and feasible_set.nonnegative:
+        # ‖row of the portfolio‖₁ is known on the simplex; elsewhere at most √L times the radius over the exposure
+        if self._fixes_rows(feasible_set) and feasible_set.nonnegative:
             weight = feasible_set.row_total / self.exposure
             value_low, value_high = weight * lowest, weight * highest
         else:
@@ -186,14 +189,18 @@ class StockPerturbation(AbstractPerturbation):
             weight = math.sqrt(count) * feasible_set.radius / self.exposure
             value_low, value_high = -weight * highest, weight * highest
         largest = jnp.maximum(jnp.abs(value_high - 1), jnp.abs(value_low - 1))
-        return jnp.sqrt(2 * largest**2 + (value_high - value_low) ** 2)
+        return jnp.broadcast_to(jnp.max(jnp.sqrt(2 * largest**2 + (value_high - value_low) ** 2)), (horizon,))
 
     def sensitivity(self, feasible_set: Any, horizon: int) -> Array:
         """√(2 Var e) / exposure where the set fixes the row sums, else with L (E e)² added under the root."""
         variance = self.second_moment - self.first_moment**2
-        if feasible_set.row_total is None:
+        if not self._fixes_rows(feasible_set):
             variance = variance + feasible_set.policy_size / 2 * self.first_moment**2
         return jnp.sqrt(2 * variance) / self.exposure
+
+    def _fixes_rows(self, feasible_set: Any) -> bool:
+        """Whether the set fixes the row sums of the portfolio: those of the free parameters, if these are its block."""
+        return feasible_set.row_total is not None and feasible_set.free_columns == feasible_set.policy_size // 2
 
     def _growth_range(self, horizon: int) -> tuple[Array, Array]:
         """The almost-sure range of e; it grows with v up to v = √T, beyond the clip for T ≥ 1."""

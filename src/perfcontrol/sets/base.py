@@ -78,3 +78,8 @@ class LiftedSet(eqx.Module):
     def policy_size(self) -> int:
         """Columns n of the lifted policy."""
         return self.shape[-1]
+
+    @property
+    def free_columns(self) -> int:
+        """Columns of the free parameters, whose rows `row_total` and `nonnegative` speak of."""
+        return self.structure.free_shape(self.shape)[-1]

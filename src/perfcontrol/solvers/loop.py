@@ -113,6 +113,13 @@ def _run(
     return jax.lax.scan(block, state, jnp.arange(count // every))
 
 
+def run_steps(
+    solver: AbstractSolver, problem: PerformativeProblem, state: State, key: Array | None, first: Array, count: int
+) -> tuple[State, Array]:
+    """`count` iterations from iteration `first` on, and the iterate after each; pure, for batched runs of one's own."""
+    return _run(solver, problem, state, key, first, count, _identity, 1)
+
+
 _compiled_run = eqx.filter_jit(_run)
 _compiled_record = eqx.filter_jit(lambda record, M: record(M))
 _compiled_init = eqx.filter_jit(lambda solver, problem, M0: solver.init(problem, M0))
@@ -239,6 +246,9 @@ def _on_host(
         if state.result != Result.running:
             break
     result, stats = _compiled_finish(solver, problem, state, stopped)
+    missing = (total - done) // every if done % every == 0 else 0
+    if missing:  # ended early: as long as under jit, the last value repeated
+        history.append(jax.tree.map(lambda leaf: jnp.repeat(leaf[-1:], missing, axis=0), history[-1]))
     return Solution(state.M, result, state.steps, _joined(history), stats)
 
 

@@ -20,6 +20,7 @@ DIVERGENCE = 1e8  # growth of ‖M‖ over 1 + ‖M_0‖ at which a run is calle
 
 class _Own(eqx.Module):
     count: Int[Array, ""]
+    deployments: Int[Array, ""]
     deployed: Array
     threshold: Array
     transform_state: Any
@@ -83,11 +84,12 @@ class RSGD(AbstractSolver):
     def init(self, problem: PerformativeProblem, M0: Array) -> State:
         transform_state = None if self.transform is None else self.transform.init(M0)
         threshold = DIVERGENCE * (1 + jnp.sqrt(jnp.sum(M0**2)))
-        return start(M0, _Own(jnp.zeros((), int), M0, threshold, transform_state))
+        return start(M0, _Own(jnp.zeros((), int), jnp.zeros((), int), M0, threshold, transform_state))
 
     def step(self, problem: PerformativeProblem, state: State, key: Array | None) -> State:
         own, M = state.own, state.M
-        deployed = jnp.where(self.schedule.deploys(own.count), M, own.deployed)
+        deploys = self.schedule.deploys(own.count)
+        deployed = jnp.where(deploys, M, own.deployed)
         gradient = self.gradient(problem, M, deployed, key, self.batch)
         transform_state = own.transform_state
         if self.transform is not None:
@@ -102,10 +104,10 @@ class RSGD(AbstractSolver):
             jnp.where(good, following, M),
             state.steps + 1,
             result,
-            _Own(own.count + 1, deployed, own.threshold, kept),
+            _Own(own.count + 1, own.deployments + deploys, deployed, own.threshold, kept),
         )
 
     def finish(self, problem: PerformativeProblem, state: State, stopped: bool) -> tuple[Result, dict[str, Array]]:
         # A fixed number of steps is what was asked for: reaching it, or the max_steps of `solve`, is success.
         result = Result.where(state.result == Result.running, Result.success, state.result)
-        return result, {"deployments": jnp.asarray(state.steps)}
+        return result, {"deployments": state.own.deployments}

@@ -23,6 +23,7 @@ from perfcontrol.solvers.rrm import frobenius
 CONTRACTING = 0.1  # repeated minimisation goes on while each step shrinks the gap at least tenfold
 HALVINGS = 6
 KRYLOV = 30
+FAR = 1e8  # growth of ‖M‖ over 1 + ‖M_0‖ + ‖Φ(M_0)‖ beyond which a Newton step is refused: see `step`
 
 
 class _Own(eqx.Module):
@@ -30,6 +31,7 @@ class _Own(eqx.Module):
     gap: Array  # ‖Φ(M) - M‖
     ratio: Array  # of the last two gaps
     unique: Array
+    limit: Array  # of ‖M‖
 
 
 class StablePoint(AbstractSolver):
@@ -63,7 +65,8 @@ class StablePoint(AbstractSolver):
         response = respond(problem, M0)
         gap = frobenius(response.M - M0)
         # A first step of repeated minimisation is always worth taking.
-        return start(M0, _Own(response.M, gap, jnp.zeros((), M0.dtype), response.unique))
+        limit = FAR * (1 + frobenius(M0) + frobenius(response.M))
+        return start(M0, _Own(response.M, gap, jnp.zeros((), M0.dtype), response.unique, limit))
 
     def step(self, problem: PerformativeProblem, state: State, key: Array | None) -> State:
         own = state.own
@@ -71,7 +74,11 @@ class StablePoint(AbstractSolver):
         F = own.response - state.M
         direction = jax.lax.cond(contracting, lambda: F, lambda: _newton_direction(problem, state.M, own.response))
 
-        # Repeated minimisation takes its step as it is; Newton halves its own until the gap shrinks.
+        # Repeated minimisation takes its step as it is; Newton halves its own until the gap shrinks. Where Φ' has the
+        # eigenvalue 1 up to rounding, Newton points to infinity, where every relative gap is small: not that far.
+        def helps(M: Array, gap: Array) -> Array:
+            return (gap < own.gap) & (frobenius(M) <= own.limit)
+
         def try_length(carry: Any) -> Any:
             length, count, *_ = carry
             M = problem.feasible_set.project(state.M + length * direction)
@@ -79,8 +86,8 @@ class StablePoint(AbstractSolver):
             return length / 2, count + 1, M, response.M, frobenius(response.M - M), response.unique
 
         def unaccepted(carry: Any) -> Array:
-            _, count, _, _, gap, _ = carry
-            return (count == 0) | (~contracting & ~(gap < own.gap) & (count < HALVINGS))
+            _, count, M, _, gap, _ = carry
+            return (count == 0) | (~contracting & ~helps(M, gap) & (count < HALVINGS))
 
         one = jnp.ones((), F.dtype)
         trial = (one, jnp.asarray(0), state.M, own.response, own.gap, own.unique)
@@ -91,11 +98,12 @@ class StablePoint(AbstractSolver):
         scale = frobenius(M)
         done = gap <= 0.1 * tolerance * jnp.where(scale > 0, scale, 1)
         # A Newton step that no longer helps has reached rounding, or is stuck: `finish` tells which by the residual.
-        stalled = ~contracting & (gap >= own.gap)
+        stalled = ~contracting & ~helps(M, gap)
         result = Result.where(done | stalled, Result.success, Result.running)
         result = Result.where(finite, result, Result.nonfinite)
-        good = finite & ~(stalled & ~done)
-        kept = jax.tree.map(lambda new, old: jnp.where(good, new, old), _Own(response, gap, ratio, unique), own)
+        good = finite & ~stalled
+        following = _Own(response, gap, ratio, unique, own.limit)
+        kept = jax.tree.map(lambda new, old: jnp.where(good, new, old), following, own)
         return State(jnp.where(good, M, state.M), state.steps + 1, result, kept)
 
     def finish(self, problem: PerformativeProblem, state: State, stopped: bool) -> tuple[Result, dict[str, Array]]:

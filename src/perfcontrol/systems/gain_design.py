@@ -31,6 +31,7 @@ def design_gain(system: LinearSystem, *, Q: Any, R: Any) -> Array:
     check_shape("Q", Q, (n, n), ("n", "n"))
     check_shape("R", R, (m, m), ("m", "m"))
     check_symmetric_psd("Q", Q, "Use a weight with no negative eigenvalue.")
+    check_symmetric_psd("R", R, "Use a weight with positive eigenvalues only.")
     if float(np.linalg.eigvalsh(np.asarray(R, dtype=float)).min()) <= 0:
         raise fail(
             "R",

@@ -6,6 +6,7 @@ import equinox as eqx
 from jaxtyping import Array
 
 from perfcontrol._checks import as_array, check_shape, fail
+from perfcontrol._linalg import Diagonal
 
 
 class LinearSystem(eqx.Module):
@@ -19,17 +20,18 @@ class LinearSystem(eqx.Module):
         InputError: shapes that do not fit, or non-finite entries.
     """
 
-    A: Array
-    B: Array
+    A: Array | Diagonal
+    B: Array | Diagonal
 
     def __init__(self, A: Any, B: Any):
-        self.A, self.B = as_array("A", A), as_array("B", B)
+        self.A = A if isinstance(A, Diagonal) else as_array("A", A)
+        self.B = B if isinstance(B, Diagonal) else as_array("B", B)
         if self.A.ndim not in (2, 3):
             raise fail("A", f"{self.A.shape}", "have shape (n, n) or (T, n, n)", "A scalar system needs [[a]].")
         if self.B.ndim not in (2, 3):
             raise fail("B", f"{self.B.shape}", "have shape (n, m) or (T, n, m)", "A single input needs a column.")
         n = self.A.shape[-1]
-        check_shape("A", self.A[..., :, :], (*self.A.shape[:-2], n, n), ("time",) * (self.A.ndim - 2) + ("n", "n"))
+        check_shape("A", self.A, (*self.A.shape[:-2], n, n), ("time",) * (self.A.ndim - 2) + ("n", "n"))
         if self.B.shape[-2] != n:
             hint = (
                 "The last two axes look swapped: pass its transpose."
@@ -44,6 +46,20 @@ class LinearSystem(eqx.Module):
                 f"have {self.A.shape[0]} time steps, as A has",
                 "Give both the same length, or one of them constant.",
             )
+
+    @classmethod
+    def diagonal(cls, a: Any, b: Any) -> "LinearSystem":
+        """The decoupled system x_i ← a_i x_i + b_i u_i: products with A and B then cost O(n) everywhere.
+
+        Args:
+            a, b: (n,) or (T, n).
+        """
+        diagonals = []
+        for name, value in (("a", as_array("a", a)), ("b", as_array("b", b))):
+            if value.ndim not in (1, 2):
+                raise fail(name, f"{value.shape}", "have shape (n,) or (T, n)", "Pass the diagonal alone.")
+            diagonals.append(Diagonal(value))
+        return cls(*diagonals)
 
     @property
     def state_size(self) -> int:

@@ -1,0 +1,34 @@
+"""Settings of long runs, checked before work starts."""
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+REGIMES = {"stable": 0.9, "unstable": 1.0, "general": 0.98}  # growth ρ in A = ρ I
+
+
+class ReproduceSettings(BaseModel):
+    """What `perfcontrol reproduce` runs. The step multiplies the gradient averaged over the stages.
+
+    The defaults are the paper's numbers where it gives them, else the completions described in
+    `perfcontrol.experiments.stock`.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    seeds: int = Field(32, ge=2, description="independent runs of each case")
+    steps: int = Field(1000, ge=100, description="iterations N of each run")
+    step_size: float = Field(0.01, gt=0, description="constant step on the stage average of the gradient")
+    feasible_set: Literal["rows", "simplex"] = Field("rows", description="row sums alone, or nonnegative as well")
+    initial_investment: float = Field(150.0, gt=0, description="q_1 of every stock")
+    rate: float = Field(0.05, description="riskless rate over the horizon")
+    trading_hours: float = Field(6.5, gt=0, lt=24, description="h, trading hours a day")
+    cure_steps: int = Field(3000, ge=100, description="iterations of the runs that show what cures divergence")
+    sweep_seeds: int = Field(8, ge=2, description="runs per step size in the search for where divergence begins")
+    sweep_steps: int = Field(600, ge=50, description="iterations of each of those")
+    seed: int = Field(0, ge=0, description="root of all randomness")
+
+    @classmethod
+    def quick(cls) -> "ReproduceSettings":
+        """Small enough to end within seconds; the verdicts are then computed from little data."""
+        return cls(seeds=4, steps=200, cure_steps=300, sweep_seeds=2, sweep_steps=100)

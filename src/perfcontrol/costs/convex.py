@@ -1,0 +1,87 @@
+"""Any convex stage cost, given as a function: for simulation and stochastic gradients."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from perfcontrol._checks import as_array, as_callable, fail, is_concrete
+from perfcontrol.costs.base import AbstractCost
+
+
+class ConvexCost(AbstractCost):
+    """c_t(x, u) = function(t, x, u), with gradients by automatic differentiation.
+
+    Costs are simulated (`simulate`, `estimate_cost`, `sample_gradient`, `RSGD`); what is exact needs a QuadraticCost.
+    Convexity and the three constants are the user's word: theory takes them as declared, nothing here checks them.
+
+    Args:
+        function: (t, x, u) -> scalar, for an integer t = 0..T (traced), x (n,) and u (m,). A plain function is static;
+            numbers to sweep belong in an eqx.Module or jax.tree_util.Partial.
+        strong_convexity: μ, jointly in x and u; None for unknown.
+        smoothness: ς, the Lipschitz constant of the joint gradient, cross derivatives included; None for unknown.
+        gradient_bound: G in ‖∇c_t‖ ≤ G D wherever ‖x‖, ‖u‖ ≤ D; None for unknown.
+
+    Raises:
+        InputError: no function, constants that are negative or contradict each other, or (when the problem is built)
+            a function that does not fit.
+
+    References:
+        Assumptions A4 (strong convexity), A5 (smoothness) and A6 (gradients).
+    """
+
+    function: Callable
+    strong_convexity: Array | None
+    smoothness: Array | None
+    gradient_bound: Array | None
+
+    def __init__(self, function: Any, strong_convexity: Any = None, smoothness: Any = None, gradient_bound: Any = None):
+        self.function = as_callable("function", function)
+        self.strong_convexity = _constant("strong_convexity", strong_convexity)
+        self.smoothness = _constant("smoothness", smoothness)
+        self.gradient_bound = _constant("gradient_bound", gradient_bound)
+        mu, sigma = self.strong_convexity, self.smoothness
+        if mu is not None and sigma is not None and is_concrete(mu) and is_concrete(sigma) and float(mu) > float(sigma):
+            raise fail(
+                "strong_convexity",
+                f"{float(mu)}",
+                f"not exceed the smoothness {float(sigma)}",
+                "No function curves more than its gradient allows.",
+            )
+
+    def check(self, state_size: int, input_size: int, horizon: int) -> None:
+        dtype = jnp.result_type(float)
+        t = jax.ShapeDtypeStruct((), jnp.result_type(int))
+        x, u = jax.ShapeDtypeStruct((state_size,), dtype), jax.ShapeDtypeStruct((input_size,), dtype)
+        try:
+            value = jax.eval_shape(lambda t, x, u: jnp.asarray(self.function(t, x, u)), t, x, u)
+        except (TypeError, ValueError) as error:
+            raise fail(
+                "function",
+                f"an error from it ({error})",
+                f"accept t, x of shape ({state_size},) and u of shape ({input_size},)",
+                "Write it in jax.numpy, for one stage; t is traced: use jnp.where, not if.",
+            ) from error
+        if value.shape != () or not jnp.issubdtype(value.dtype, jnp.floating):
+            got = f"{value.dtype} of shape {value.shape}"
+            raise fail("function", got, "return one real number", "Sum over the components of x and u.")
+
+    def _times(self, x: Array) -> Array:
+        return jnp.arange(x.shape[0])
+
+    def path_cost(self, x: Array, u: Array) -> Array:
+        return jax.vmap(self.function)(self._times(x), x, u)
+
+    def path_gradients(self, x: Array, u: Array) -> tuple[Array, Array]:
+        return jax.vmap(jax.grad(self.function, argnums=(1, 2)))(self._times(x), x, u)
+
+
+def _constant(name: str, value: Any) -> Array | None:
+    if value is None:
+        return None
+    number = as_array(name, value)
+    if number.ndim or (is_concrete(number) and float(number) < 0):
+        raise fail(name, str(value), "be a nonnegative number", "Pass None where it is not known.")
+    return number

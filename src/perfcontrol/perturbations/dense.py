@@ -1,0 +1,206 @@
+"""Location and scale of dense random matrices: Δ_t = mean(M)[t] + scale(M)[t] Z_t, entry by entry."""
+
+import math
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Key
+
+from perfcontrol._checks import as_array, fail
+from perfcontrol.perturbations.base import AbstractPerturbation, CovarianceOperator, DenseDraws, Draws, zero_mean
+from perfcontrol.perturbations.dependence import Dependence, check_values, largest_entries, matrix_slope_norm, slopes
+from perfcontrol.perturbations.scalar_laws import SCALAR_LAWS
+from perfcontrol.policy_maps import AbstractPolicyMap, as_policy_map, evaluate_map
+from perfcontrol.random_vectors import AbstractRandomVector
+
+WHITE_LAWS = (*sorted(SCALAR_LAWS), "sphere")
+
+
+class _WhiteCovariance(CovarianceOperator):
+    """Entries uncorrelated: E[(S∘Z) X (S∘Z)ᵀ] = diag_i(Σ_a S_ia² X_aa)."""
+
+    variances: Array  # (T, n, p)
+
+    @property
+    def steps(self) -> Any:
+        return self.variances
+
+    def apply_step(self, step: Any, X: Array) -> Array:
+        return jnp.diag(step @ jnp.diagonal(X))
+
+    def adjoint_step(self, step: Any, X: Array) -> Array:
+        return jnp.diag(jnp.diagonal(X) @ step)
+
+
+class _ColouredCovariance(CovarianceOperator):
+    """E[(S∘Z) X (S∘Z)ᵀ]_ij = Σ_ab S_ia S_jb Cov(Z_ia, Z_jb) X_ab about the mean of Z."""
+
+    scales: Array  # (T, n, p)
+    spread: Array  # (n, p, n, p)
+
+    @property
+    def steps(self) -> Any:
+        return self.scales
+
+    def apply_step(self, step: Any, X: Array) -> Array:
+        return jnp.einsum("ia,jb,iajb,ab->ij", step, step, self.spread, X, optimize="optimal")
+
+    def adjoint_step(self, step: Any, X: Array) -> Array:
+        return jnp.einsum("ia,jb,iajb,ij->ab", step, step, self.spread, X, optimize="optimal")
+
+
+class DensePerturbation(AbstractPerturbation):
+    """Random matrices whose location and scale depend on the policy.
+
+    Δ_t = mean(M)[t] + scale(M)[t] Z_t, the scale multiplying all entries or each its own; Z_t independent over time.
+    For uncorrelated entries of unit variance and a common scale s: E[(sZ) X (sZ)ᵀ] = s² tr(X) I.
+
+    Args:
+        scale: policy map, callable or array with values (), (T,), (n, p) or (T, n, p).
+        mean: policy map, callable or array with values (n, p) or (T, n, p); None is zero.
+        law: of Z: "rademacher", "uniform" or "truncated_gaussian" (independent entries of zero mean and unit variance),
+            "sphere" (uniform on the Frobenius sphere of radius √(n p), also of unit variances), or any random vector
+            of dimension n p, which fills Z row by row; then its mean and covariance count too.
+        on_input: whether Δ acts on [x; u], p = n+m, instead of x, p = n.
+
+    Raises:
+        InputError: unknown law, or shapes that do not fit (when the problem is built).
+    """
+
+    scale: Dependence
+    mean_map: Dependence | None
+    law: AbstractRandomVector | None
+    kind: str = eqx.field(static=True)
+    on_input: bool = eqx.field(static=True)
+
+    def __init__(self, scale: Any, mean: Any = None, law: Any = "uniform", on_input: bool = False):
+        self.scale = as_policy_map("scale", scale)
+        self.mean_map = None if mean is None else as_policy_map("mean", mean)
+        if isinstance(law, AbstractRandomVector):
+            self.law, self.kind = law, "vector"
+            if law.mean.ndim != 1:
+                required = "be the same at all times"
+                raise fail("law", f"{type(law).__name__} of {law.mean.shape[0]} steps", required, "Use `mean` instead.")
+        elif law in WHITE_LAWS:
+            self.law, self.kind = None, law
+        else:
+            raise fail("law", repr(law), f"be a random vector or one of {WHITE_LAWS}", "Pass one of these.")
+        self.on_input = bool(on_input)
+
+    def columns(self, state_size: int, input_size: int) -> int:
+        return state_size + input_size if self.on_input else state_size
+
+    def check(self, policy_shape: tuple[int, int, int], horizon: int) -> None:
+        _, m, n = policy_shape
+        p = self.columns(n, m)
+        dtype = jnp.result_type(float) if isinstance(self.scale, AbstractPolicyMap) else self.scale.dtype
+        check_values("scale", self.scale, policy_shape, [(), (horizon,), (n, p), (horizon, n, p)], dtype)
+        if self.mean_map is not None:
+            check_values("mean", self.mean_map, policy_shape, [(n, p), (horizon, n, p)], dtype)
+        if self.law is not None and self.law.resize(n * p).size != n * p:
+            raise fail(
+                "law",
+                f"dimension {self.law.size}",
+                f"have dimension n p = {n * p}",
+                f"One entry per entry of the {n} x {p} matrix; `on_input` decides p.",
+            )
+
+    def _shape(self, M: Array) -> tuple[int, int]:
+        return M.shape[-1], self.columns(M.shape[-1], M.shape[-2])
+
+    def scales(self, M: Array, horizon: int) -> Array:
+        """scale(M) entry by entry, (T, n, p)."""
+        values = as_array("scale", evaluate_map(self.scale, M))
+        if values.ndim == 1:
+            values = values[:, None, None]
+        return jnp.broadcast_to(values, (horizon, *self._shape(M)))
+
+    def _vector(self, M: Array) -> AbstractRandomVector:
+        assert self.law is not None
+        return self.law.resize(math.prod(self._shape(M)))
+
+    def sample(self, key: Key[Array, ""], M: Array, horizon: int) -> Draws:
+        shape, scales = (horizon, *self._shape(M)), self.scales(M, horizon)
+        if self.law is not None:
+            Z = self._vector(M).sample(key, horizon).reshape(shape)
+        elif self.kind == "sphere":
+            normal = jax.random.normal(key, shape, scales.dtype)
+            Z = normal * jnp.sqrt(shape[1] * shape[2] / jnp.sum(normal**2, axis=(-2, -1), keepdims=True))
+        else:
+            Z = SCALAR_LAWS[self.kind].sample(key, shape, scales.dtype)
+        matrices = scales * Z
+        return DenseDraws(matrices if self.mean_map is None else matrices + self._location(M, horizon))
+
+    def _location(self, M: Array, horizon: int) -> Array:
+        if self.mean_map is None:
+            return zero_mean(M, horizon, self._shape(M)[1])
+        return jnp.broadcast_to(evaluate_map(self.mean_map, M), (horizon, *self._shape(M)))
+
+    def mean(self, M: Array, horizon: int) -> Array:
+        location = self._location(M, horizon)
+        if self.law is None:
+            return location
+        return location + self.scales(M, horizon) * self._vector(M).mean.reshape(self._shape(M))
+
+    def mean_operator(self, M: Array, horizon: int) -> Array | None:
+        return None if self.mean_map is None and self.law is None else self.mean(M, horizon)
+
+    def covariance(self, M: Array, horizon: int) -> CovarianceOperator:
+        scales = self.scales(M, horizon)
+        if self.law is None:
+            return _WhiteCovariance(scales**2)
+        shape = self._shape(M)
+        return _ColouredCovariance(scales, self._vector(M).covariance.reshape(*shape, *shape))
+
+    def policy_free_mean(self) -> bool:
+        by_scale = self.law is not None and isinstance(self.scale, AbstractPolicyMap)
+        return not (by_scale or isinstance(self.mean_map, AbstractPolicyMap))
+
+    def bound(self, feasible_set: Any, horizon: int) -> Array | None:
+        """sup ‖mean‖ + sup ‖scale Z‖_F; known for affine maps on a bounded set and a bounded law."""
+        n, p = self._set_shape(feasible_set)
+        largest = largest_entries(self.scale, feasible_set)
+        if largest is None:
+            return None
+        entrywise = jnp.broadcast_to(largest[..., None, None] if largest.ndim < 2 else largest, (horizon, n, p))
+        if self.kind in SCALAR_LAWS:
+            total = SCALAR_LAWS[self.kind].bound * jnp.sqrt(jnp.sum(entrywise**2, axis=(-2, -1)))
+        else:
+            norm = math.sqrt(n * p) if self.law is None else self.law.resize(n * p).bound
+            if norm is None:
+                return None
+            total = norm * jnp.max(entrywise, axis=(-2, -1))
+        if self.mean_map is not None:
+            means = largest_entries(self.mean_map, feasible_set)
+            if means is None:
+                return None
+            # Entrywise suprema: only the Frobenius norm is monotone in them.
+            order = "fro" if isinstance(self.mean_map, AbstractPolicyMap) else 2
+            total = total + jnp.linalg.norm(means, ord=order, axis=(-2, -1))
+        return jnp.broadcast_to(total, (horizon,))
+
+    def sensitivity(self, feasible_set: Any, horizon: int) -> Array | None:
+        """‖mean slope‖ + √E‖(scale slope) Z‖²_F, by coupling both laws through the same Z; known for affine maps."""
+        n, p = self._set_shape(feasible_set)
+        slope = slopes(self.scale)
+        by_mean = jnp.zeros(()) if self.mean_map is None else matrix_slope_norm(self.mean_map)
+        if slope is None or by_mean is None:
+            return None
+        if self.law is None:
+            second = jnp.ones((n, p))
+        else:
+            law = self.law.resize(n * p)
+            second = (jnp.diagonal(law.covariance) + law.mean**2).reshape(n, p)
+        if slope.ndim < 5:  # one scale for all entries
+            by_scale = jnp.sqrt(jnp.sum(slope**2, axis=tuple(range(-3, 0))) * jnp.sum(second)) if slope.ndim else 0.0
+        else:
+            weighted = slope * jnp.sqrt(second)[..., None, None, None]
+            flat = weighted.reshape(*slope.shape[:-5], n * p, -1)
+            by_scale = jnp.linalg.norm(flat, ord=2, axis=(-2, -1))
+        return jnp.broadcast_to(by_scale + by_mean, (horizon,))
+
+    def _set_shape(self, feasible_set: Any) -> tuple[int, int]:
+        _, m, n = feasible_set.shape
+        return n, self.columns(n, m)

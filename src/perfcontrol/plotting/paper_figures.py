@@ -1,0 +1,142 @@
+"""The figures of the paper's numerical section, and the one it lacks."""
+
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+import xarray
+from matplotlib.axes import Axes
+from matplotlib.ticker import LogLocator, NullFormatter
+
+from perfcontrol.config import ReproduceSettings
+from perfcontrol.plotting.style import ORDER_COLOURS, ORDER_MARKS, REGIME_TITLES, band, save_figure, styled
+
+CEILING = 1e4  # of the error axis, relative to the first error: beyond it a run has left for good
+
+
+def draw_all(
+    out: Path,
+    exact: xarray.Dataset,
+    runs: xarray.Dataset,
+    cure: xarray.Dataset,
+    sweep: xarray.Dataset,
+    settings: ReproduceSettings,
+) -> list[Path]:
+    """Figures 1, 2 and 3 as PNG and SVG."""
+    with styled():
+        files = figure_error(runs, out / "figure1_error")
+        files += figure_cost(runs, out / "figure2_cost")
+        files += figure_cure(cure, sweep, settings, out / "figure3_cure")
+    return files
+
+
+def _quantiles(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """10 %, median, 90 % over seeds (first axis)."""
+    low, middle, high = np.percentile(values, [10, 50, 90], axis=0)
+    return low, middle, high
+
+
+def _log_axes(axes: Axes) -> None:
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.yaxis.set_minor_formatter(NullFormatter())
+    axes.yaxis.set_major_locator(LogLocator(numticks=7))
+
+
+def _guide(axes: Axes, start: float, end: float, level: float) -> None:
+    """A 1/n line."""
+    n = np.array([start, end])
+    axes.plot(n, level * start / n, color="#555555", linestyle=(0, (4, 3)), linewidth=1)
+    axes.annotate(
+        r"$1/n$", (n[1], level * start / end), xytext=(-2, 5), textcoords="offset points", ha="right", color="#555555"
+    )
+
+
+def figure_error(runs: xarray.Dataset, path: Path) -> list[Path]:
+    """Figure 1: squared distance to the stable policy against the iteration, one panel a regime."""
+    figure, panels = plt.subplots(1, 3, figsize=(7.4, 2.6), sharey=True, layout="constrained")
+    steps = runs["step"].values[1:]
+    first = float(runs["error"].isel(step=0).median())
+    for axes, regime in zip(panels, REGIME_TITLES, strict=True):
+        for order in ORDER_COLOURS:
+            values = runs["error"].sel(regime=regime, order=order).values[:, 1:]
+            band(axes, steps, *_quantiles(np.minimum(values, 10 * CEILING * first)), order)
+        _log_axes(axes)
+        axes.set_title(REGIME_TITLES[regime])
+        axes.set_xlabel("iteration $n$")
+        _guide(axes, steps[-1] / 20, steps[-1], 0.05 * first)
+    panels[0].set_ylim(float(runs["error"].min()) / 2, CEILING * first)
+    panels[0].set_ylabel(r"$\|M_n - M^{\mathrm{PS}}\|_F^2$")
+    panels[0].legend(title=r"order of $\varepsilon_t$", loc="lower left")
+    return save_figure(figure, path)
+
+
+def figure_cost(runs: xarray.Dataset, path: Path) -> list[Path]:
+    """Figure 2: exact performative cost of the iterates, the stable policy's as a dotted line."""
+    figure, panels = plt.subplots(1, 3, figsize=(7.4, 2.6), layout="constrained")
+    steps = runs["step"].values[1:]
+    for axes, regime in zip(panels, REGIME_TITLES, strict=True):
+        lowest, highest = np.inf, 0.0
+        for order, colour in ORDER_COLOURS.items():
+            values = runs["cost"].sel(regime=regime, order=order).values
+            stable = float(runs["stable_cost"].sel(regime=regime, order=order))
+            ceiling = CEILING * np.median(values[:, 0])
+            low, middle, high = _quantiles(np.minimum(values[:, 1:], ceiling))
+            band(axes, steps, low, middle, high, order)
+            axes.axhline(stable, color=colour, linestyle=":", linewidth=1)
+            lowest = min(lowest, stable, low.min())
+            highest = max(highest, np.median(values[:, 0]), min(middle.max(), 300 * np.median(values[:, 0])))
+        _log_axes(axes)
+        axes.set_ylim(lowest / 1.6, highest * 1.6)
+        axes.set_title(REGIME_TITLES[regime])
+        axes.set_xlabel("iteration $n$")
+    panels[0].set_ylabel(r"$C_T(M_n; M_n)$")
+    panels[0].plot([], [], color="#555555", linestyle=":", linewidth=1, label=r"at $M^{\mathrm{PS}}$")
+    panels[0].legend(title=r"order of $\varepsilon_t$")
+    return save_figure(figure, path)
+
+
+def figure_cure(cure: xarray.Dataset, sweep: xarray.Dataset, settings: ReproduceSettings, path: Path) -> list[Path]:
+    """Figure 3: the unstable regime with a diminishing step, a smaller step, a bounded set; where divergence begins."""
+    figure, panels = plt.subplots(1, 3, figsize=(7.4, 2.7), layout="constrained")
+    left, middle, right = panels
+    steps = cure["step_diminishing"].values
+    for order in ORDER_COLOURS:
+        band(left, steps, *_quantiles(cure["diminishing"].sel(order=order).values), order)
+    _log_axes(left)
+    _guide(left, steps[-1] / 20, steps[-1], 0.35 * float(cure["diminishing"].isel({"step_diminishing": 0}).median()))
+    left.set_title(rf"diminishing step ${settings.step_size:g}\cdot 10/(n+10)$")
+    left.set_ylabel(r"$\|M_n - M^{\mathrm{PS}}\|_F^2$")
+    left.legend(title=r"order of $\varepsilon_t$", loc="lower left")
+
+    for name, style in (("smaller", "-"), ("simplex", (0, (1, 1)))):
+        n = cure[f"step_{name}"].values
+        for order, colour in ORDER_COLOURS.items():
+            values = cure[name].sel(order=order).values
+            middle.plot(n, np.median(values, axis=0), color=colour, linestyle=style)
+    middle.plot([], [], color="#555555", label="five times smaller step")
+    middle.plot([], [], color="#555555", linestyle=(0, (1, 1)), label="same step, simplex")
+    _log_axes(middle)
+    middle.set_title("constant step, cured (medians)")
+    middle.legend(loc="lower left")
+    for axes in (left, middle):
+        axes.set_xlabel("iteration $n$")
+
+    away = ((sweep["relative_error"] > 1) | (sweep["result"] != "success")).mean("seed")
+    for order, colour in ORDER_COLOURS.items():
+        right.plot(
+            sweep["factor"], 100 * away.sel(order=order), color=colour, marker=ORDER_MARKS[order], markersize=4, label=order
+        )
+    right.axvline(1, color="#555555", linestyle=(0, (4, 3)), linewidth=1)
+    right.annotate(
+        "mean-square\nthreshold", (1, 100), xytext=(-4, -4), textcoords="offset points", ha="right", va="top", color="#555555"
+    )
+    right.set_xscale("log")
+    ticks = [0.25, 0.5, 1, 2, 3]
+    right.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+    right.xaxis.set_minor_formatter(NullFormatter())
+    right.set_xlabel("constant step / threshold")
+    right.set_ylabel("seeds that diverge (%)")
+    right.set_title("where divergence begins")
+    return save_figure(figure, path)

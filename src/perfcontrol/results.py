@@ -1,0 +1,62 @@
+"""Results on disk: labelled arrays in NetCDF, tables in JSON and Markdown, each file written whole or not at all."""
+
+import importlib.metadata
+import json
+import os
+import platform
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import xarray
+
+
+@contextmanager
+def written_whole(path: Path) -> Iterator[Path]:
+    """A temporary path beside `path` that takes its place when the block ends well, and vanishes otherwise."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}.", suffix=path.suffix)
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        yield temporary
+        # mkstemp makes files private; results are for everyone whom the folder is for
+        temporary.chmod(0o644)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def versions() -> dict[str, str]:
+    """What the numbers depend on."""
+    names = ("perfcontrol", "jax", "jaxlib", "numpy", "equinox")
+    return {"python": platform.python_version(), **{name: importlib.metadata.version(name) for name in names}}
+
+
+def save_dataset(dataset: xarray.Dataset, path: Path, attributes: Mapping[str, Any]) -> None:
+    """Write a dataset as NetCDF with settings and versions in its attributes (nested ones as JSON)."""
+    plain = {key: value if isinstance(value, str | int | float) else json.dumps(value) for key, value in attributes.items()}
+    dataset = dataset.assign_attrs({**plain, "versions": json.dumps(versions())})
+    encoding = {str(name): {"zlib": True, "complevel": 1} for name, values in dataset.data_vars.items() if values.ndim}
+    with written_whole(path) as temporary:
+        dataset.to_netcdf(temporary, engine="h5netcdf", encoding=encoding)
+
+
+def load_dataset(path: Path) -> xarray.Dataset:
+    """Read a dataset into memory and close the file."""
+    with xarray.open_dataset(path, engine="h5netcdf") as dataset:
+        return dataset.load()
+
+
+def save_json(data: Any, path: Path) -> None:
+    """Write JSON; non-finite numbers are refused."""
+    with written_whole(path) as temporary:
+        temporary.write_text(json.dumps(data, indent=2, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def save_text(text: str, path: Path) -> None:
+    """Write text."""
+    with written_whole(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")

@@ -1,0 +1,300 @@
+"""Intersections of feasible sets: Dykstra's projections, finished by Newton steps on their fixed-point equations.
+
+With y the point to project, x its projection and p_i the part of y - x that set i is responsible for,
+
+    x = P_i(x + p_i) for every set i,     y = x + Σ_i p_i,
+
+and conversely any such x is the projection. Dykstra's sweep keeps the second equation exactly and drives the first
+ones to hold; that is safe from everywhere but only linear at best, and can stall. A Newton step through the
+derivatives of the P_i is tried after some sweeps, and taken where it makes the defect smaller. The same linear
+system, solved once at the end, is the derivative of the projection.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from perfcontrol._checks import fail, is_concrete
+from perfcontrol._linalg import symmetrise
+from perfcontrol.sets.base import AbstractSet
+
+SWEEPS = 20  # of Dykstra between two Newton steps
+ROUNDS = 12  # of sweeps and a Newton step in a stage, at most
+STAGES = 60  # on the way to a point far outside, at most
+LENGTHS = (1.0, 0.5, 0.25, 0.1, 0.03)  # of Newton steps
+NEWTON_LIMIT = 512  # free parameters up to which derivatives of projections are held as matrices
+ACCURACY = 1e-8  # what a projection promises, relative
+
+Sets = tuple[AbstractSet, ...]
+
+
+class _Split(eqx.Module):
+    """A point x and the parts p_i, with x + Σ p_i = y; the defect is √Σ‖P_i(x + p_i) - x‖²."""
+
+    x: Float[Array, " p"]
+    parts: Float[Array, "k p"]
+    defect: Float[Array, ""]
+
+
+def _projections(sets: Sets, points: Float[Array, "k p"], shape: tuple[int, ...]) -> Float[Array, "k p"]:
+    """P_i of the i-th row."""
+    return jnp.stack([s.project(z.reshape(shape)).reshape(-1) for s, z in zip(sets, points, strict=True)])
+
+
+def _split(sets: Sets, x: Array, parts: Array, shape: tuple[int, ...]) -> _Split:
+    return _Split(x, parts, jnp.sqrt(jnp.sum((_projections(sets, x + parts, shape) - x) ** 2)))
+
+
+def _sweep(sets: Sets, x: Array, parts: Array, shape: tuple[int, ...]) -> tuple[Array, Array]:
+    """One round of Dykstra: every set in turn takes over what it moved."""
+    rows = []
+    for member, part in zip(sets, parts, strict=True):
+        point = x + part
+        x = member.project(point.reshape(shape)).reshape(-1)
+        rows.append(point - x)
+    return x, jnp.stack(rows)
+
+
+class _Linearised:
+    """The equations dx = J_i (dx + dp_i) + e_i, dx + Σ dp_i = dy, J_i the derivative of P_i at x + p_i.
+
+    Along the null space of J_i they fix dx; across them dp_i = J_i⁺ (dx - e_i) - Π_i dx with Π_i = J_i⁺ J_i.
+    """
+
+    def __init__(self, sets: Sets, split: _Split, shape: tuple[int, ...]):
+        size, dtype = split.x.size, split.x.dtype
+        eps = float(jnp.finfo(dtype).eps)
+        inverses, normals = [], []
+        for member, part in zip(sets, split.parts, strict=True):
+
+            def flat(z: Array, member: AbstractSet = member) -> Array:
+                return member.project(z.reshape(shape)).reshape(-1)
+
+            values, vectors = jnp.linalg.eigh(symmetrise(jax.jacfwd(flat)(split.x + part)))
+            kept = values > 1e3 * eps
+            inverses.append((vectors * jnp.where(kept, 1 / jnp.where(kept, values, 1), 0)) @ vectors.T)
+            normals.append((vectors * ~kept) @ vectors.T)
+        self.inverses, self.normals = jnp.stack(inverses), jnp.stack(normals)
+        values, vectors = jnp.linalg.eigh(jnp.sum(self.normals, axis=0))
+        fixed = values > 1e4 * eps
+        self.held = (vectors * jnp.where(fixed, 1 / jnp.where(fixed, values, 1), 0)) @ vectors.T
+        self.free = (vectors * ~fixed) @ vectors.T
+        eye = jnp.eye(size, dtype=dtype)
+        self.metric = eye + jnp.sum(self.inverses + self.normals - eye, axis=0)
+        self.system = jax.scipy.linalg.lu_factor(self.free @ self.metric @ self.free + eye - self.free)
+
+    def move(self, errors: Float[Array, "k p"], dy: Float[Array, " p"]) -> Array:
+        """dx."""
+        held = self.held @ jnp.einsum("kab,kb->a", self.normals, errors)
+        right = dy + jnp.einsum("kab,kb->a", self.inverses, errors) - self.metric @ held
+        return held + self.free @ jax.scipy.linalg.lu_solve(self.system, self.free @ right)
+
+    def parts(self, errors: Float[Array, "k p"], dx: Array, dy: Array) -> Float[Array, "k p"]:
+        """dp_i, the undetermined components shared out evenly."""
+        moved = jnp.einsum("kab,kb->ka", self.inverses, dx - errors) - (dx - self.normals @ dx)
+        rest = self.held @ (dy - dx - jnp.sum(moved, axis=0))
+        return moved + self.normals @ rest
+
+
+class _Progress(eqx.Module):
+    """How far along the segment from a nearly feasible point to y the projection is known, and what is tried next."""
+
+    reached: Float[Array, ""]  # fraction of the segment; 0 before the first success
+    parts: Float[Array, "k p"]  # there
+    tried: Float[Array, ""]
+    split: _Split  # of the last trial
+    count: Int[Array, ""]
+
+
+@eqx.filter_jit
+def _solve(sets: Sets, M: Array) -> _Split:
+    """The projection of M as a `_Split`.
+
+    A point far outside, in units of the sets, is approached in stages along the segment from a nearly feasible point:
+    the parts grow in proportion, so that each stage starts close to its solution.
+    """
+    shape, dtype = M.shape, M.dtype
+    y = M.reshape(-1)
+    goal = 50 * float(jnp.finfo(dtype).eps) * (1 + jnp.sqrt(jnp.sum(y**2)))
+    rounds = ROUNDS if y.size <= NEWTON_LIMIT else 50 * ROUNDS
+    zero, lengths = jnp.zeros_like(y), jnp.asarray(LENGTHS, dtype)
+
+    def improve(carry: tuple[_Split, Array]) -> tuple[_Split, Array]:
+        split, count = carry
+        x, parts = jax.lax.fori_loop(0, SWEEPS, lambda _, now: _sweep(sets, *now, shape), (split.x, split.parts))
+        split = _split(sets, x, parts, shape)
+        if y.size <= NEWTON_LIMIT:
+            linear = _Linearised(sets, split, shape)
+            errors = _projections(sets, x + parts, shape) - x
+            dx = linear.move(errors, zero)
+            dparts = linear.parts(errors, dx, zero)
+            tried = jax.vmap(lambda t: _split(sets, x + t * dx, parts + t * dparts, shape))(lengths)
+            best = jnp.nanargmin(jnp.append(tried.defect, split.defect))
+            split = jax.tree.map(lambda new, old: jnp.concatenate([new, old[None]])[best], tried, split)
+        return split, count + 1
+
+    def unsolved(carry: tuple[_Split, Array]) -> Array:
+        return (carry[0].defect > goal) & (carry[1] < rounds)
+
+    start = _split(sets, y, jnp.zeros((len(sets), y.size), dtype), shape)
+    centre = jax.lax.fori_loop(0, SWEEPS, lambda _, x: _sweep(sets, x, jnp.zeros_like(start.parts), shape)[0], y)
+
+    def stage(now: _Progress) -> _Progress:
+        target = centre + now.tried * (y - centre)
+        parts = now.parts * (now.tried / jnp.where(now.reached > 0, now.reached, 1))
+        first = _split(sets, target - jnp.sum(parts, axis=0), parts, shape)
+        split, _ = jax.lax.while_loop(unsolved, improve, (first, jnp.asarray(0)))
+        solved = split.defect <= goal
+        reached = jnp.where(solved, now.tried, now.reached)
+        nearer = jnp.where(now.reached > 0, jnp.sqrt(now.reached * now.tried), now.tried / 64)
+        following = jnp.where(solved, jnp.minimum(8 * now.tried, 1), nearer)
+        return _Progress(reached, jnp.where(solved, split.parts, now.parts), following, split, now.count + 1)
+
+    def unfinished(now: _Progress) -> Array:
+        return (now.reached < 1) & (now.count < STAGES)
+
+    reached = jnp.where(start.defect > goal, 0.0, 1.0).astype(dtype)
+    first = _Progress(reached, start.parts, jnp.ones((), dtype), start, jnp.asarray(0))
+    last = jax.lax.while_loop(unfinished, stage, first)
+    # Where even that fails, the split of the start keeps the defect honest: it is not small.
+    return jax.tree.map(lambda new, old: jnp.where(last.reached < 1, old, new), last.split, start)
+
+
+@eqx.filter_custom_jvp
+def _project(sets: Sets, M: Array) -> Array:
+    """The projection, polished by the last set, so that bounds hold exactly where that set is a box."""
+    split = _solve(sets, M)
+    return sets[-1].project((split.x + split.parts[-1]).reshape(M.shape))
+
+
+@_project.def_jvp
+def _project_derivative(primals: tuple[Sets, Array], tangents: tuple[Any, Array | None]) -> tuple[Array, Array]:
+    sets, M = primals
+    moved_sets, dM = tangents
+    shape = M.shape
+    split = _solve(sets, M)
+    value = sets[-1].project((split.x + split.parts[-1]).reshape(shape))
+    dy = jnp.zeros_like(split.x) if dM is None else dM.reshape(-1)
+    rows = []
+    for member, tangent, part in zip(sets, moved_sets, split.parts, strict=True):
+        point = (split.x + part).reshape(shape)
+        if jax.tree.leaves(tangent):
+            rows.append(eqx.filter_jvp(lambda s, z=point: s.project(z), (member,), (tangent,))[1].reshape(-1))
+        else:
+            rows.append(jnp.zeros_like(split.x))
+    linear = _Linearised(sets, split, shape)
+    return value, linear.move(jnp.stack(rows), dy).reshape(shape)
+
+
+@eqx.filter_jit
+def _support(sets: Sets, direction: Array, reach: Array) -> Array:
+    """sup <direction, M> by two proximal steps of length t from 0: x' = P(x + t d) has sup - <d, x'> ≤ ‖x' - x‖ 2R/t."""
+    norm = jnp.sqrt(jnp.sum(direction**2))
+    unit = direction / jnp.where(norm > 0, norm, 1)
+    length = (1e5 if direction.dtype == jnp.float64 else 1e3) * reach
+    before = _project(sets, length * unit)
+    after = _project(sets, before + length * unit)
+    gap = jnp.sqrt(jnp.sum((after - before) ** 2)) * 2 * reach / jnp.where(length > 0, length, 1)
+    return norm * (jnp.sum(unit * after) + gap)
+
+
+class Intersection(AbstractSet):
+    """The policies that lie in every one of several sets.
+
+    Projections come from Dykstra's algorithm with Newton steps, accurate to 1e-8 (usually to rounding); their
+    derivative from the fixed-point equations. For more than 512 free parameters Dykstra works alone, and carries no
+    useful derivative.
+
+    Args:
+        sets: one or more feasible sets, nested intersections included.
+
+    Raises:
+        InputError: no sets, or sets without a common point: at once where the sets tell the policy's shape, else when
+            the problem is built.
+
+    References:
+        Boyle and Dykstra (1986), A method for finding projections onto the intersection of convex sets.
+    """
+
+    sets: Sets
+
+    def __init__(self, sets: Sequence[AbstractSet]):
+        if isinstance(sets, AbstractSet) or not all(isinstance(member, AbstractSet) for member in sets):
+            raise fail("sets", repr(type(sets).__name__), "be a sequence of feasible sets", "Pass a list of sets.")
+        flat = [part for member in sets for part in (member.sets if isinstance(member, Intersection) else (member,))]
+        if not flat:
+            raise fail("sets", "none", "hold at least one set", "Pass pc.Unconstrained() for no constraint.")
+        # Sets that fix signs come last: what projects last holds exactly.
+        self.sets = tuple(sorted(flat, key=lambda member: member.nonnegative))
+        for member in self.sets:
+            shapes = [leaf.shape for leaf in jax.tree.leaves(member) if leaf.ndim == 3]
+            if shapes:
+                self.check(shapes[0])
+                break
+
+    def check(self, shape: tuple[int, ...]) -> None:
+        for member in self.sets:
+            member.check(shape)
+        leaves = [leaf for leaf in jax.tree.leaves(self.sets) if eqx.is_array(leaf)]
+        if not all(is_concrete(leaf) for leaf in leaves):
+            return
+        dtype = jnp.result_type(float, *[leaf.dtype for leaf in leaves if jnp.issubdtype(leaf.dtype, jnp.floating)])
+        point = self.project(jnp.zeros(shape, dtype))
+        gaps = [float(jnp.linalg.norm(point - member.project(point))) for member in self.sets]
+        # Sets that touch are approached slowly: call them apart only where they clearly are.
+        if not max(gaps) <= math.sqrt(ACCURACY) * (1 + float(jnp.linalg.norm(point))):
+            worst = type(self.sets[int(np.argmax(gaps))]).__name__
+            raise fail(
+                "sets",
+                f"a nearest point that is {max(gaps):.3g} away from the {worst}",
+                "have a common point: their intersection is empty",
+                "Relax one of them.",
+            )
+
+    def project(self, M: Array) -> Array:
+        if len(self.sets) == 1:
+            return self.sets[0].project(M)
+        return _project(self.sets, M)
+
+    def contains(self, M: Array, tolerance: float = 1e-8) -> Array:
+        """Whether every set contains M."""
+        return jnp.all(jnp.stack([member.contains(M, tolerance) for member in self.sets]))
+
+    def support(self, direction: Array) -> Array | None:
+        """Proved upper bound, exact to about 1e-9 relative to the radius; None where no radius is known."""
+        shape = direction.shape[-3:]
+        reach = self.radius(shape)
+        if reach is None:
+            return None
+        if len(self.sets) == 1:
+            return self.sets[0].support(direction)
+        flat = direction.reshape(-1, *shape)
+        best = jax.vmap(lambda d: _support(self.sets, d, reach.astype(d.dtype)))(flat).reshape(direction.shape[:-3])
+        known = [value for member in self.sets if (value := member.support(direction)) is not None]
+        return jnp.min(jnp.stack([best, *known]), axis=0)
+
+    @property
+    def affine(self) -> bool:
+        return all(member.affine for member in self.sets)
+
+    def radius(self, shape: tuple[int, ...]) -> Array | None:
+        """An upper bound: the least of the sets' radii."""
+        known = [value for member in self.sets if (value := member.radius(shape)) is not None]
+        if self.nonnegative and self.row_total is not None:
+            known.append(jnp.linalg.norm(jnp.broadcast_to(self.row_total, shape[:-1])))
+        return None if not known else jnp.min(jnp.stack(known))
+
+    @property
+    def row_total(self) -> Array | None:
+        totals = [member.row_total for member in self.sets if member.row_total is not None]
+        return totals[0] if totals else None
+
+    @property
+    def nonnegative(self) -> bool:
+        return any(member.nonnegative for member in self.sets)

@@ -1,0 +1,99 @@
+"""What a certificate says: whether it applies, whether it holds, by how much, and how each fact in it is known."""
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+Status = Literal["proved", "declared", "estimated"]
+KINDS = ("paper", "rigorous", "global", "sharp")
+TITLES = {
+    "paper": "The paper's sufficient condition, constants as printed",
+    "rigorous": "The sufficient condition with corrected constants",
+    "global": "The global contraction bound",
+    "sharp": "The local test at the stable policy",
+}
+
+
+@dataclass(frozen=True)
+class Assumption:
+    """One thing that a verdict rests on, and how it is known.
+
+    status: "proved" (follows from the problem as given), "declared" (taken from the user's word), or "estimated"
+    (sampled or computed in floating point at a point, without a proof).
+    """
+
+    text: str
+    status: Status
+
+    def __str__(self) -> str:
+        return f"{self.text} ({self.status})"
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """The verdict of one certificate on one problem.
+
+    applicable: whether its assumptions can be met at all; if not, `missing` names what is lacking, and `holds`,
+        `lhs`, `rhs`, `rate` are None. Not applicable never means "does not hold".
+    holds: True where this certificate proves (sharp: finds) that the best response Φ contracts.
+    exists: whether a performatively stable policy exists: True, False or None (unknown); `existence` says why.
+    lhs, rhs: the two sides; it holds where lhs < rhs. margin: rhs - lhs.
+    rate: its bound of the contraction rate of Φ (sharp: the local rate itself).
+    weights: (T,), what one unit of ε_t adds to lhs: the propagation and aggregation of sensitivities; None for
+        kinds that do not split that way. contributions: (T,), ε_t times weights.
+    assumptions: what the verdict rests on. values: further numbers, by name.
+    """
+
+    kind: str
+    applicable: bool
+    missing: tuple[str, ...] = ()
+    holds: bool | None = None
+    exists: bool | None = None
+    existence: str = "nothing is known about existence"
+    lhs: float | None = None
+    rhs: float | None = None
+    rate: float | None = None
+    weights: np.ndarray | None = None
+    contributions: np.ndarray | None = None
+    assumptions: tuple[Assumption, ...] = ()
+    values: dict[str, Any] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+    @property
+    def margin(self) -> float | None:
+        """rhs - lhs: positive where the certificate holds."""
+        if self.lhs is None or self.rhs is None:
+            return None
+        return self.rhs - self.lhs
+
+    def __str__(self) -> str:
+        sentences = [self._verdict(), *self.notes, self._existence()]
+        if self.assumptions:
+            sentences.append("It rests on: " + "; ".join(str(item) for item in self.assumptions) + ".")
+        return " ".join(sentence for sentence in sentences if sentence)
+
+    def _verdict(self) -> str:
+        title = TITLES.get(self.kind, self.kind)
+        if not self.applicable:
+            return f"{title} is not applicable here, which says nothing against the problem: {'; '.join(self.missing)}."
+        numbers = f"{self.lhs:.4g} {'<' if self.holds else '>='} {self.rhs:.4g}"
+        if self.kind == "sharp":
+            if self.holds:
+                return (
+                    f"{title} finds that repeated minimisation converges locally: spectral radius {numbers}, so that "
+                    f"near the stable policy each round shrinks the error by about {self.rate:.4g}."
+                )
+            return f"{title} finds no local convergence of repeated minimisation: spectral radius {numbers}."
+        if self.holds:
+            return f"{title} holds ({numbers}): repeated minimisation contracts by at least {self.rate:.4g} a round."
+        return f"{title} does not hold ({numbers}); it is sufficient, not necessary, so nothing follows from that."
+
+    def _existence(self) -> str:
+        verdict = {True: "A stable policy exists", False: "No stable policy exists", None: "Existence is open"}
+        return f"{verdict[self.exists]}: {self.existence}."
+
+
+def not_applicable(kind: str, missing: list[str], exists: bool | None, existence: str, **values: Any) -> Certificate:
+    """A certificate whose assumptions cannot be met, with the reasons."""
+    return Certificate(kind, False, tuple(missing), exists=exists, existence=existence, values=values)

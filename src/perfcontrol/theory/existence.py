@@ -1,0 +1,76 @@
+"""Existence of a stable policy by compactness, apart from any contraction.
+
+Two fixed-point arguments (docs: theory, section on existence), neither of which needs small sensitivities:
+
+- *bounded set*: 𝕄 compact and convex, D_t continuous ⇒ Φ is upper hemicontinuous with convex values (Kakutani).
+- *bounded response*: quadratic cost, fixed directions, mean of Δ free of the policy, continuous scales, an affine
+  set, and a cost that is strictly convex along the set already without perturbations. C_T(·; M') is then a weighted
+  least-squares problem whose non-negative weights alone depend on M', and such minimisers stay in one bounded set.
+"""
+
+import jax
+import numpy as np
+
+from perfcontrol.costs import QuadraticCost
+from perfcontrol.perturbations import DirectionalPerturbation, NoPerturbation
+from perfcontrol.policy_maps import AbstractPolicyMap, Affine
+from perfcontrol.problem import PerformativeProblem
+from perfcontrol.theory.local import hessian_without_reaction, tangent_basis
+
+
+def set_radius(problem: PerformativeProblem) -> float | None:
+    """sup ‖M‖_F over the feasible set, free parameters; None if unbounded."""
+    radius = problem.feasible_set.radius(problem.policy_shape)
+    return None if radius is None else float(radius)
+
+
+def reaction_is_continuous(problem: PerformativeProblem) -> bool:
+    """Whether M ↦ D_t(M) is known to be continuous: a finite sensitivity, or a smooth family of this package."""
+    return problem.sensitivity() is not None or isinstance(problem.perturbation, DirectionalPerturbation)
+
+
+def existence(problem: PerformativeProblem) -> tuple[bool | None, str]:
+    """True with the argument that proves it, or None with the reason why neither argument applies."""
+    if set_radius(problem) is not None and reaction_is_continuous(problem):
+        return True, "the feasible set is compact and convex and the reaction continuous (Kakutani's theorem)"
+    if bounded_response(problem):
+        return True, (
+            "best responses are minimisers of least-squares problems whose non-negative weights alone depend on the "
+            "deployed policy, so they stay in a bounded set (Brouwer's theorem)"
+        )
+    if set_radius(problem) is None:
+        return None, "the feasible set is unbounded, and no other argument applies"
+    return None, "the reaction is not known to be continuous"
+
+
+def bounded_response(problem: PerformativeProblem) -> bool:
+    """Whether the least-squares argument applies."""
+    law = problem.perturbation
+    if not isinstance(problem.cost, QuadraticCost) or not problem.feasible_set.affine:
+        return False
+    if isinstance(law, DirectionalPerturbation):
+        if isinstance(law.mean_map, AbstractPolicyMap) and not constant_mean(problem):
+            return False
+    elif not isinstance(law, NoPerturbation):
+        return False
+    basis = tangent_basis(problem)
+    if basis.shape[1] == 0:
+        return True
+    values = np.linalg.eigvalsh(basis.T @ hessian_without_reaction(problem) @ basis)
+    return bool(values[0] > 1e-10 * max(values[-1], np.finfo(float).tiny))
+
+
+def constant_mean(problem: PerformativeProblem) -> bool:
+    """Whether E Δ_t is the same for every policy of the set: known to the family, or an affine map with no slope
+    along the set."""
+    law = problem.perturbation
+    if law.policy_free_mean():
+        return True
+    if getattr(problem.perturbation, "portfolio", None) is not None:  # the stock market: the mean follows row sums
+        return problem.feasible_set.row_total is not None
+    mean_map = getattr(law, "mean_map", None)
+    if not isinstance(mean_map, Affine):
+        return False
+    slopes = mean_map.slope.reshape(-1, *problem.lifted_shape)
+    free = np.asarray(jax.vmap(problem.structure.adjoint)(slopes)).reshape(slopes.shape[0], -1)
+    return bool(np.max(np.abs(free @ tangent_basis(problem)), initial=0.0) <= 1e-12 * (1 + np.max(np.abs(free))))

@@ -1,0 +1,120 @@
+"""The paper's stock market."""
+
+import jax
+import numpy as np
+import pytest
+import scipy.integrate
+
+import perfcontrol as pc
+from perfcontrol.perturbations.stock import growth_moments
+from tests.contracts.perturbation import PerturbationContract
+from tests.tools import assert_close, assert_refused, normal
+
+SENSITIVITIES = [0.05, 0.5, 0.02]
+EXPOSURE = 0.4
+
+
+class StockContract(PerturbationContract):
+    shape = (1, 4, 4)
+    samples = 4_000
+    structure = pc.RepeatedBlock(2)
+    volatility = "lognormal"
+
+    def perturbation(self):
+        return pc.StockPerturbation(SENSITIVITIES, 0.05, EXPOSURE, self.volatility)
+
+
+class TestOnTheSimplex(StockContract):
+    feasible_set = pc.RowSimplex(EXPOSURE)
+
+
+class TestOnASimplexOfUnequalRows(StockContract):
+    feasible_set = pc.RowSimplex([[0.2, 0.4]])
+
+
+class TestOnRowSums(StockContract):
+    feasible_set = pc.RowSum(EXPOSURE)
+    knows = ("mean", "covariance", "sensitivity")
+
+
+class TestOnABall(StockContract):
+    feasible_set = pc.FrobeniusBall(0.7)
+
+
+class TestWithoutStructure(StockContract):
+    structure = pc.FullStructure()
+    feasible_set = pc.RowSimplex(EXPOSURE)
+
+
+class TestAsPrinted(StockContract):
+    feasible_set = pc.RowSimplex(EXPOSURE)
+    volatility = "as_printed"
+
+
+@pytest.mark.parametrize("kind", ["lognormal", "as_printed"])
+def test_growth_moments_match_adaptive_quadrature(kind):
+    """Sensitivities on both sides of the clip, integrated piece by piece between its kinks."""
+    sensitivities, rate = np.array([0.01, 0.3, 0.6, 1.5, 3.0]), 0.05
+    first, second = growth_moments(np.log(sensitivities), rate, kind)
+    for t, sensitivity in enumerate(sensitivities):
+
+        def growth(z, sensitivity=sensitivity):
+            gaussian = np.log(sensitivity) + 0.2 * z
+            v = np.clip(np.exp(gaussian) if kind == "lognormal" else gaussian, -0.6, 0.6)
+            return np.exp((rate - v**2 / 2) / 5 + v / np.sqrt(5))
+
+        ends = [np.log(0.6)] if kind == "lognormal" else [-0.6, 0.6]
+        kinks = sorted(np.clip((np.array(ends) - np.log(sensitivity)) / 0.2, -10, 10))
+        for power, moment in ((1, first), (2, second)):
+            exact = scipy.integrate.quad(
+                lambda z, power=power, growth=growth: growth(z) ** power * np.exp(-(z**2) / 2) / np.sqrt(2 * np.pi),
+                -10,
+                10,
+                points=kinks,
+                epsabs=1e-14,
+                epsrel=1e-13,
+                limit=200,
+            )[0]
+            assert moment[t] == pytest.approx(exact, rel=1e-12)
+
+
+def test_stock_moments_match_their_closed_form():
+    """E V = g₁ (row sums), Cov V = (g₂ - g₁²) (portfolio portfolioᵀ) on the diagonals of Δ's blocks."""
+    law = pc.StockPerturbation(SENSITIVITIES, 0.05, EXPOSURE)
+    block = np.abs(np.asarray(normal(1, 1, 3, 3)))
+    M = pc.RepeatedBlock(2).lift(block)
+    portfolio = block[0] / EXPOSURE
+    g1, g2 = growth_moments(np.log(SENSITIVITIES), 0.05, "lognormal")
+    mean = law.mean(M, 3)
+    X, Y = np.asarray(normal(2, 6, 6)), np.asarray(normal(3, 6, 6))
+    applied, pulled = law.covariance(M, 3).apply(X), law.covariance(M, 3).adjoint(Y)
+    for t in range(3):
+        assert_close(mean[t], np.diag(np.tile(g1[t] * portfolio.sum(axis=1) - 1, 2)))
+        spread = (g2[t] - g1[t] ** 2) * portfolio @ portfolio.T
+        down, right = np.vstack([np.eye(3), np.eye(3)]), np.hstack([np.zeros((3, 3)), np.eye(3)])
+        # Δ - Θ = down diag(V - E V) right
+        assert_close(applied[t], down @ (spread * (right @ X @ right.T)) @ down.T)
+        assert_close(pulled[t], right.T @ (spread * (down.T @ Y @ down)) @ right)
+
+
+def test_as_printed_volatility_has_next_to_no_variance():
+    """The Gaussian of the paper's sensitivities is below the clip: v = -0.6, and nothing reacts."""
+    law = pc.StockPerturbation([0.001, 0.05, 0.1], 0.05, EXPOSURE, "as_printed")
+    M = pc.RepeatedBlock(2).lift(np.full((1, 3, 3), EXPOSURE / 3))
+    drawn = np.asarray(law.sample(jax.random.key(0), M, 3).dense())
+    assert np.abs(drawn - np.asarray(law.mean(M, 3))).max() < 1e-9
+
+
+STOCKS_REFUSED = {
+    "negative": (lambda: pc.StockPerturbation([0.1, -0.1], 0.05, 0.4), "sensitivities", "positive"),
+    "matrix": (lambda: pc.StockPerturbation([[0.1]], 0.05, 0.4), "sensitivities", "(1, 1)"),
+    "volatility": (lambda: pc.StockPerturbation([0.1], 0.05, 0.4, "normal"), "volatility", "'normal'"),
+    "rate": (lambda: pc.StockPerturbation([0.1], [0.05], 0.4), "rate", "(1,)"),
+    "odd state": (lambda: pc.StockPerturbation([0.1], 0.05, 0.4).check((1, 3, 3), 1), "perturbation", "2L"),
+    "days": (lambda: pc.StockPerturbation([0.1], 0.05, 0.4).check((1, 4, 4), 3), "sensitivities", "(3,)"),
+}
+
+
+@pytest.mark.parametrize("case", STOCKS_REFUSED.values(), ids=STOCKS_REFUSED.keys())
+def test_stock_perturbation_is_refused_with_a_four_part_error(case):
+    assert_refused(*case)

@@ -1,0 +1,74 @@
+"""Small problems whose stable policies are known, shared by the tests of the solvers."""
+
+import jax.numpy as jnp
+import numpy as np
+
+import perfcontrol as pc
+from tests.tools import normal
+
+MEAN, DEVIATION = 10.0, 0.1
+
+
+def performative_prediction(sensitivity, mean=MEAN, deviation=DEVIATION, feasible_set=None) -> pc.PerformativeProblem:
+    """Scalar performative mean estimation (maths: section 7): Φ(M) = mean + sensitivity M."""
+    return pc.PerformativeProblem(
+        system=pc.LinearSystem([[0.0]], [[-1.0]]),
+        horizon=2,
+        noise=pc.Constant([1.0]),
+        cost=pc.QuadraticCost(np.array([0.0, 0.0, 0.5])[:, None, None], [[0.0]]),
+        perturbation=pc.DirectionalPerturbation(
+            [[[1.0]]], jnp.asarray([deviation]), mean=pc.Affine([[mean - 1]], [[[[[sensitivity]]]]])
+        ),
+        feasible_set=feasible_set,
+    )
+
+
+def drifting(seed: int = 0, feasible_set=None, covariance=None) -> pc.PerformativeProblem:
+    """Three states, two inputs, two lags, a gain, noise with a mean; mildly performative."""
+    slope = 0.05 * normal(seed + 1, 6, 1, 2, 2, 3)
+    return pc.PerformativeProblem(
+        system=pc.LinearSystem(0.25 * normal(seed + 2, 3, 3), normal(seed + 3, 3, 2)),
+        horizon=6,
+        noise=pc.Gaussian([0.1, -0.2, 0.3], 0.2 * np.eye(3) if covariance is None else covariance),
+        cost=pc.QuadraticCost(np.eye(3), 0.5 * np.eye(2)),
+        memory=2,
+        gain=0.1 * normal(seed + 4, 2, 3),
+        perturbation=pc.DirectionalPerturbation(
+            0.5 * normal(seed + 5, 1, 3, 3), pc.Affine(jnp.full((6, 1), 0.4), slope)
+        ),
+        feasible_set=feasible_set,
+        initial_state=[1.0, 0.0, -1.0],
+    )
+
+
+def _switched_scale(M, params):
+    """Standard deviation between √low and √high, a steep function of one statistic of the policy."""
+    statistic = jnp.sum(params["direction"] * M) - params["centre"]
+    variance = params["low"] + (params["high"] - params["low"]) * (1 + jnp.tanh(params["slope"] * statistic)) / 2
+    return jnp.sqrt(variance)[None]
+
+
+def _switched(direction, centre, slope, low=0.05, high=2.0) -> pc.PerformativeProblem:
+    params = {"direction": direction, "centre": centre, "slope": slope, "low": low, "high": high}
+    return pc.PerformativeProblem(
+        system=pc.LinearSystem(0.4 * normal(2, 3, 3), normal(3, 3, 2)),
+        horizon=6,
+        noise=pc.Gaussian(np.zeros(3), np.diag([1.0, 0.5, 2.0])),
+        cost=pc.QuadraticCost(np.eye(3), np.eye(2)),
+        memory=2,
+        perturbation=pc.DirectionalPerturbation(normal(5, 1, 3, 3), pc.Function(_switched_scale, params)),
+        initial_state=[1.0, 0.0, -1.0],
+    )
+
+
+def strongly_performative(slope: float = 8.0) -> pc.PerformativeProblem:
+    """Three states, two lags, one stable policy, at which the derivative of Φ has an eigenvalue far below -1.
+
+    The world is calm where the policy is that of a turbulent one and turbulent where it is that of a calm one, so
+    repeated minimisation jumps between the two; the statistic of Φ decreases in its own, so it crosses once.
+    """
+    nowhere = jnp.zeros((2, 2, 3))
+    calm = pc.best_response(_switched(nowhere, jnp.asarray(1.0), 50.0), nowhere)
+    turbulent = pc.best_response(_switched(nowhere, jnp.asarray(-1.0), 50.0), nowhere)
+    direction = (calm - turbulent) / jnp.sum((calm - turbulent) ** 2)  # 1 apart in the statistic
+    return _switched(direction, jnp.sum(direction * (calm + turbulent)) / 2, slope)

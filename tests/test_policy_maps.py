@@ -1,0 +1,66 @@
+"""How a quantity depends on the policy."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import perfcontrol as pc
+from perfcontrol.policy_maps import as_policy_map, evaluate_map
+from tests.tools import assert_close, assert_refused, normal
+
+M = normal(1, 2, 3, 4)
+
+
+@pytest.mark.float32
+def test_affine_is_offset_plus_inner_product():
+    offset, slope = normal(2, 5, 2), normal(3, 5, 2, 2, 3, 4)
+    expected = np.asarray(offset) + np.einsum("tkimn,imn->tk", slope, M)
+    assert_close(pc.Affine(offset, slope)(M), expected, 1e-13, 1e-5)
+    assert_close(jax.jacobian(pc.Affine(offset, slope))(M), slope, 0, 0)
+
+
+def test_affine_scalar_offset_takes_one_slope():
+    assert_close(pc.Affine(1.0, np.ones((2, 3, 4)))(M), 1 + np.sum(M))
+
+
+def test_function_receives_its_params_as_leaves():
+    policy_map = pc.Function(lambda M, p: p["a"] * jnp.sum(M) + p["b"], {"a": 2, "b": np.array([1, 0])})
+    assert_close(policy_map(M), 2 * np.sum(M) + np.array([1.0, 0.0]))
+    assert len(jax.tree.leaves(policy_map)) == 2
+    assert_close(pc.Function(jnp.sum)(M), np.sum(M))
+
+
+def test_function_params_sweep_without_recompiling():
+    traced = []
+
+    def f(M, p):
+        traced.append(1)
+        return p * M[0, 0, 0]
+
+    run = jax.jit(lambda policy_map: policy_map(M))
+    values = [float(run(pc.Function(f, p))) for p in (1.0, 2.0, 3.0)]
+    assert len(traced) == 1
+    assert_close(values, np.array([1.0, 2.0, 3.0]) * float(M[0, 0, 0]))
+
+
+def test_plain_callables_and_arrays_become_maps_and_constants():
+    assert isinstance(as_policy_map("scale", jnp.sum), pc.Function)
+    assert_close(evaluate_map(as_policy_map("scale", [1, 2]), M), [1.0, 2.0])
+    affine = pc.Affine(1.0, np.ones((1, 1, 1)))
+    assert as_policy_map("scale", affine) is affine
+
+
+MAPS_REFUSED = {
+    "slope of two axes": (lambda: pc.Affine(0.0, np.ones((2, 2))), "slope", "(2, 2)"),
+    "slope and offset": (lambda: pc.Affine(np.zeros(3), np.ones((2, 1, 1, 1))), "slope", "(3,)"),
+    "nan offset": (lambda: pc.Affine(np.nan, np.ones((1, 1, 1))), "offset", "nan"),
+    "not callable": (lambda: pc.Function(3), "f", "callable"),
+    "nan params": (lambda: pc.Function(lambda M, p: p, {"a": np.nan}), "params", "nan"),
+    "scale of words": (lambda: as_policy_map("scale", "large"), "scale", "array of real numbers"),
+}
+
+
+@pytest.mark.parametrize("case", MAPS_REFUSED.values(), ids=MAPS_REFUSED.keys())
+def test_policy_map_is_refused_with_a_four_part_error(case):
+    assert_refused(*case)
