@@ -61,7 +61,8 @@ def as_array(name: str, value: Any) -> Array:
                     stacklevel=3,
                 )
         array = jnp.asarray(host, dtype=float)
-    if is_concrete(array) and not bool(jnp.all(jnp.isfinite(array))):
+    # NumPy, not JAX: inside a trace even an operation on known numbers gives a tracer.
+    if is_concrete(array) and not np.all(np.isfinite(np.asarray(array))):
         bad = np.argwhere(~np.isfinite(np.asarray(array)))[0].tolist()
         raise fail(
             name,

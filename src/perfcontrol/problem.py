@@ -117,7 +117,7 @@ class PerformativeProblem(eqx.Module):
                 "A_t and B_t are given for t = 0..horizon-1.",
             )
         reacting_noise = callable(noise) and not isinstance(noise, AbstractRandomVector)
-        self.noise = as_policy_map("noise", noise) if reacting_noise else self._law("noise", noise, n)
+        self.noise = as_policy_map("noise", noise) if reacting_noise else self._law("noise", noise, n)  # type: ignore
         if isinstance(initial_state, Sequence):
             raise fail("initial_state", "a Sequence", "be one random vector", "Pass an array (n,) or another law.")
         self.initial_state = self._law(

@@ -104,7 +104,7 @@ class Uniform(_Entrywise):
 
     def __init__(self, low: Any, high: Any):
         self.low, self.high = _paired("low", low, "high", high)
-        if is_concrete(self.low) and is_concrete(self.high) and bool(jnp.any(self.low > self.high)):
+        if is_concrete(self.low) and is_concrete(self.high) and np.any(np.asarray(self.low) > self.high):
             raise fail("low", f"{self.low} > {self.high}", "not exceed `high`", "Swap the two arguments.")
 
     @property

@@ -37,7 +37,9 @@ def versions() -> dict[str, str]:
 
 def save_dataset(dataset: xarray.Dataset, path: Path, attributes: Mapping[str, Any]) -> None:
     """Write a dataset as NetCDF with settings and versions in its attributes (nested ones as JSON)."""
-    plain = {key: value if isinstance(value, str | int | float) else json.dumps(value) for key, value in attributes.items()}
+    plain = {
+        key: value if isinstance(value, str | int | float) else json.dumps(value) for key, value in attributes.items()
+    }
     dataset = dataset.assign_attrs({**plain, "versions": json.dumps(versions())})
     encoding = {str(name): {"zlib": True, "complevel": 1} for name, values in dataset.data_vars.items() if values.ndim}
     with written_whole(path) as temporary:

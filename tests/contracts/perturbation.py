@@ -62,14 +62,22 @@ class PerturbationContract:
         p, n, T = law.columns(cls.shape[2], cls.shape[1]), cls.shape[2], cls.horizon
         if law.mean(policies[index], T) is None:
             return None
-        arguments = {"X": random_psd(43, p), "Y": random_psd(47, n), "Xt": normal(44, T, p, p), "Yt": normal(45, T, n, n)}
+        arguments = {
+            "X": random_psd(43, p),
+            "Y": random_psd(47, n),
+            "Xt": normal(44, T, p, p),
+            "Yt": normal(45, T, n, n),
+        }
 
         @eqx.filter_jit
         def compute(law, M, X, Y, Xt, Yt):
             covariance, operator = law.covariance(M, T), law.mean_operator(M, T)
             applied = {"X": covariance.apply(X), "Xt": covariance.apply(Xt)}
             applied |= {"Y": covariance.adjoint(Y), "Yt": covariance.adjoint(Yt)}
-            applied |= {"X again": covariance.apply(jnp.stack([X] * T)), "Y again": covariance.adjoint(jnp.stack([Y] * T))}
+            applied |= {
+                "X again": covariance.apply(jnp.stack([X] * T)),
+                "Y again": covariance.adjoint(jnp.stack([Y] * T)),
+            }
             return law.mean(M, T), None if operator is None else as_dense(operator), applied
 
         mean, operator, applied = compute(law, policies[index], **arguments)

@@ -49,7 +49,9 @@ def test_quadratic_cost_matches_the_dense_oracle():
 
 
 def test_quadratic_cost_has_no_factor_one_half():
-    assert_close(pc.QuadraticCost([[2.0]], [[3.0]]).path_cost(normal(1, 1, 1) * 0 + 5, normal(1, 1, 1) * 0 + 7), [197.0])
+    assert_close(
+        pc.QuadraticCost([[2.0]], [[3.0]]).path_cost(normal(1, 1, 1) * 0 + 5, normal(1, 1, 1) * 0 + 7), [197.0]
+    )
 
 
 Q, R = np.eye(3), np.eye(2)

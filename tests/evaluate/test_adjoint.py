@@ -8,7 +8,7 @@ import pytest
 
 import perfcontrol as pc
 from perfcontrol.evaluate.adjoint import mean_path_gradient
-from perfcontrol.evaluate.rollout import Path, run_path, sample_path
+from perfcontrol.evaluate.rollout import run_path, sample_path
 from tests.evaluate.cases import BUILDERS, SmoothCost, case, replaced
 from tests.oracles.printed_gradient import printed_gradient
 from tests.tools import assert_close, assert_mean_is, central_differences, relative_error
@@ -68,7 +68,7 @@ def test_path_gradient_matches_central_differences_when_the_cost_is_not_quadrati
     assert relative_error(gradient, differences) < 1e-8
 
 
-@pytest.mark.parametrize("name", ["everything varies", "everything varies, performative B", "repeated block"])
+@pytest.mark.parametrize("name", ["everything varies, performative B", "repeated block"])
 def test_path_gradients_within_five_standard_errors_of_the_expected_gradient(name):
     c = case(name)
 
@@ -76,27 +76,18 @@ def test_path_gradients_within_five_standard_errors_of_the_expected_gradient(nam
     def gradients(problem, keys):
         return jax.vmap(lambda key: mean_path_gradient(problem, c.M, c.deployed, key, 1))(keys)
 
-    samples = gradients(c.problem, jax.random.split(jax.random.key(3), 8000))
+    samples = gradients(c.problem, jax.random.split(jax.random.key(3), 3000))
     assert_mean_is(samples, pc.expected_gradient(c.problem, c.M, deployed=c.deployed))
 
 
-@pytest.mark.parametrize("name", ["zero means", "nothing reacts"])
-def test_sample_gradient_is_the_mean_over_the_simulated_paths(name):
-    c = case(name)
+def test_sample_gradient_is_the_mean_over_the_simulated_paths():
+    c = case("zero means")
     key = jax.random.key(4)
-    trajectories = pc.simulate(c.problem, c.M, deployed=c.deployed, key=key, samples=5)
-    together = pc.path_gradient(c.problem, trajectories)
-    assert_close(pc.sample_gradient(c.problem, c.M, deployed=c.deployed, key=key, samples=5), together)
-    one_by_one = [
-        pc.path_gradient(
-            c.problem,
-            Path(trajectories.x[s], trajectories.u[s], trajectories.w[s], jax.tree.map(lambda leaf, s=s: leaf[s], trajectories.draws)),
-        )
-        for s in range(2)
-    ]  # fmt: skip
-    assert one_by_one[0].shape == c.problem.policy_shape
-    first_two = pc.simulate(c.problem, c.M, deployed=c.deployed, key=key, samples=2)
-    assert_close(pc.path_gradient(c.problem, first_two), (one_by_one[0] + one_by_one[1]) / 2)
+    trajectories = pc.simulate(c.problem, c.M, deployed=c.deployed, key=key, samples=3)
+    together = eqx.filter_jit(pc.path_gradient)(c.problem, trajectories)
+    assert_close(pc.sample_gradient(c.problem, c.M, deployed=c.deployed, key=key, samples=3), together)
+    mean_cost = jax.jit(lambda M: jnp.mean(jax.vmap(lambda path: _cost(c.problem, M, path))(trajectories)))
+    assert_close(together, central_differences(lambda M: mean_cost(jnp.asarray(M)), c.M, step=0.1), 1e-10)
 
 
 @pytest.mark.float32

@@ -7,6 +7,8 @@ import pytest
 
 import perfcontrol as pc
 from perfcontrol.experiments import stock_market, stock_sensitivities
+from perfcontrol.perturbations.stock import growth_moments
+from tests.oracles.moments import expected_cost_moments
 from tests.tools import assert_close, assert_refused, tolerance
 
 CASES = [(order, growth) for growth in (0.9, 0.98, 1.0) for order in ("ascending", "descending", "random")]
@@ -109,7 +111,7 @@ def test_stable_policy_has_the_same_entries_for_all_identical_stocks(nine):
     for case, _, solution in nine:
         M = np.asarray(solution.M[0])
         alpha_beta, beta = M[0, 0], M[0, 1]
-        np.testing.assert_allclose(M, (alpha_beta - beta) * np.eye(10) + beta, rtol=1e-9, err_msg=str(case))
+        np.testing.assert_allclose(M, (alpha_beta - beta) * np.eye(10) + beta, rtol=1e-9, atol=1e-13, err_msg=str(case))
         assert alpha_beta + 9 * beta == pytest.approx(EXPOSURE, rel=1e-12)
 
 
@@ -121,71 +123,59 @@ def test_stable_policy_is_the_same_from_random_feasible_starts(nine):
             assert case in CASES
 
 
-def test_stable_policies_of_the_nine_cases_equal_their_closed_form_on_the_row_sums():
-    """alpha I + beta 11ᵀ is one number: the gradient along it, by hand from moments of two scalars."""
-    for order, growth in (CASES[0], CASES[4], CASES[8]):
-        problem = stock_market(order, growth=growth)
-        M = np.asarray(pc.solve(problem, pc.StablePoint()).M[0])
-        assert (M[0, 0] - M[0, 1]) == pytest.approx(_alpha_by_hand(order, growth), rel=1e-8)
+@pytest.mark.parametrize("nine", ["rows"], indirect=True)
+def test_stable_policy_is_stationary_for_the_dense_moment_oracle(nine):
+    """The cost of nearby feasible policies in the world of the stable one, from NumPy moments of the paper's model."""
+    for (order, growth), _, solution in (nine[1], nine[8]):
+        stable = np.asarray(solution.M[0])
+        world = lambda M, order=order, growth=growth, stable=stable: _oracle_cost(M, stable, order, growth)  # noqa: E731
+        rng = np.random.default_rng(0)
+        for _ in range(2):
+            direction = rng.normal(size=(10, 10))
+            direction -= direction.mean(axis=1, keepdims=True)
+            direction *= 0.01 / np.abs(direction).max()
+            up, here, down = (world(stable + sign * direction) for sign in (1, 0, -1))
+            curvature, slope = up - 2 * here + down, (up - down) / 2
+            assert curvature > 0 and abs(slope) < 1e-6 * curvature
 
 
-def _alpha_by_hand(order: str, growth: float) -> float:
-    """The stable alpha from one stock's scalar recursions.
+def _oracle_cost(M: np.ndarray, deployed: np.ndarray, order: str, growth: float) -> float:
+    """Appendix A in the oracle's terms: Δ_t = [[E V - I, V - E V], [0, V - I]], V = diag(portfolio e_t)."""
+    first, second = growth_moments(np.log(stock_sensitivities(order)), 0.05, "lognormal")
+    portfolio = deployed / EXPOSURE
+    gram = portfolio @ portfolio.T
+    eye, zero = np.eye(10), np.zeros((10, 10))
+    shown = np.block([[eye, zero], [zero, zero]])
+    mean = np.stack([np.kron(np.eye(2), np.diag(g * portfolio.sum(axis=1) - 1)) for g in first])
 
-    With the policy alpha I + beta 11ᵀ the mean dynamics of every stock are F_t = growth + g₁(t) - 1 on r and q alike,
-    and r_{t+1} = F_t r_t + (V_t - E V_t) q_t + u_t + w_t - E w. The cost sees r alone, so the impulse of w - E w at
-    time s, through r and q both, is paid with Λ of the pair; M multiplies (w - E w) in r and w in q.
-    """
-    from perfcontrol.perturbations.stock import growth_moments
+    def spread(t: int, X: np.ndarray) -> np.ndarray:
+        return np.kron(np.ones((2, 2)), (second[t] - first[t] ** 2) * gram * X[10:, 10:])
 
-    g1, g2 = growth_moments(np.log(stock_sensitivities(order)), 0.05, "lognormal")
-    variance, F = g2 - g1**2, growth + g1 - 1
-    stocks, horizon = 10, 60
-    eye, ones = np.eye(stocks), np.ones((stocks, stocks))
-
-    def gradient(alpha: float) -> float:
-        beta = (EXPOSURE - alpha) / stocks
-        M = alpha * eye + beta * ones
-        gram = M @ M.T / EXPOSURE**2
-        # Λ on [r; q]: R, C, P blocks, each p I + s 11ᵀ; kept dense here
-        R, C, P = eye, 0 * eye, 0 * eye
-        blocks = [(R, C, P)]
-        for t in reversed(range(horizon)):
-            total = R + C + C.T + P
-            R, C, P = eye + F[t] ** 2 * R, F[t] ** 2 * C, F[t] ** 2 * P + variance[t] * gram * total
-            blocks.insert(0, (R, C, P))
-        direction = eye - ones / stocks  # of alpha on the row-sum set
-        slope = 0.0
-        mean_q = np.full(stocks, 150.0)  # E q_t; E r_t = 0
-        feed = 0.5 * M.sum(axis=1)
-        # the part of the fluctuation: every impulse w̃_s = w_s - E w meets r and q alike
-        for s in range(horizon):
-            for t in range(s + 1, horizon + 1):
-                own = (1.0 if t == s + 1 else 0.0)
-                if not own:
-                    continue
-                R, C, P = blocks[t + 1] if t < horizon else (0 * eye, 0 * eye, 0 * eye)
-                total = R + C + C.T + P
-                through = F[t] * total if t < horizon else 0 * eye
-                slope += np.sum(direction * (2 * ((eye + total) @ M + through))) / 12
-        # the mean part: E u acts on q alone, and along `direction` its row sums vanish
-        assert np.allclose(direction @ np.ones(stocks), 0) and mean_q.size == feed.size
-        return slope
-
-    low, high = -2.0, 2.0
-    assert gradient(low) < 0 < gradient(high)
-    for _ in range(80):
-        middle = (low + high) / 2
-        low, high = (middle, high) if gradient(middle) < 0 else (low, middle)
-    return low
+    return expected_cost_moments(
+        A=np.broadcast_to(growth * np.eye(20), (60, 20, 20)),
+        B=np.broadcast_to(np.eye(20), (60, 20, 20)),
+        K=np.zeros((61, 20, 20)),
+        Q=np.broadcast_to(shown, (61, 20, 20)),
+        R=np.broadcast_to(shown, (61, 20, 20)),
+        M=np.kron(np.eye(2), M)[None],
+        noise_mean=np.broadcast_to(np.repeat([0.0, 0.5], 10), (60, 20)),
+        noise_covariance=np.broadcast_to(np.kron(np.ones((2, 2)), eye) / 12, (60, 20, 20)),
+        perturbation_mean=mean,
+        covariance_apply=spread,
+        initial_mean=np.repeat([0.0, 150.0], 10),
+        initial_covariance=np.zeros((20, 20)),
+    )
 
 
 @pytest.mark.float32
+@pytest.mark.parametrize("nine", ["rows"], indirect=True)
 def test_exact_cost_within_five_standard_errors_of_monte_carlo(nine):
     for case, problem, solution in (nine[0], nine[4]):
         estimate = pc.estimate_cost(problem, solution.M, key=jax.random.key(1), samples=2048)
         exact = float(pc.expected_cost(problem, solution.M))
-        assert abs(float(estimate.mean) - exact) <= 5 * float(estimate.standard_error) + tolerance(0, 1e-3) * exact, case
+        assert abs(float(estimate.mean) - exact) <= 5 * float(estimate.standard_error) + tolerance(0, 1e-3) * exact, (
+            case
+        )
 
 
 # --- the paper's algorithm -------------------------------------------------------------------------------------------
@@ -213,7 +203,9 @@ def test_nothing_depends_on_the_policy_when_the_volatility_is_as_printed():
     assert np.abs(variance).max() < 1e-12
     means = [problem.perturbation.mean(problem.lift(M), 60) for M in (one, two)]
     assert_close(means[0], means[1], 1e-12)
-    assert_close(pc.best_response(problem, one), pc.best_response(problem, two), 1e-10)
+    costs = [float(pc.expected_cost(problem, one, deployed=M)) for M in (one, two)]
+    assert costs[0] == pytest.approx(costs[1], rel=1e-11)
+    assert float(pc.expected_cost(problem, two, deployed=two)) != pytest.approx(costs[0], rel=1e-3)
     expected = np.exp((0.05 - 0.18) / 60 - 0.6 / np.sqrt(60))
     assert_close(problem.perturbation.first_moment, np.full(60, expected), 1e-12)
 
@@ -227,9 +219,9 @@ REFUSED = {
     "volatility": (lambda: stock_market(volatility="normal"), "volatility", "'normal'", "as_printed"),
     "hours": (lambda: stock_market(trading_hours=24), "trading_hours", "24"),
     "no hours": (lambda: stock_market(trading_hours=0), "trading_hours", "between 0 and 24"),
-    "growth": (lambda: stock_market(growth=[1.0, 1.0]), "growth", "number"),
+    "growth": (lambda: stock_market(growth=[1.0, 1.0]), "growth", "(2,)", "one number"),
     "infinite growth": (lambda: stock_market(growth=float("inf")), "growth", "finite"),
-    "investment": (lambda: stock_market(initial_investment=[1.0, 2.0]), "initial_investment", "number"),
+    "investment": (lambda: stock_market(initial_investment=[1.0, 2.0]), "initial_investment", "(2,)", "one number"),
     "rate": (lambda: stock_market(rate=float("nan")), "rate", "finite"),
 }
 

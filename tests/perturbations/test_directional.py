@@ -43,7 +43,9 @@ class TestPerformativeInputMatrix(PerturbationContract):
 
     def perturbation(self):
         scale = pc.Affine([0.5, -1.0, 0.2], 0.1 * normal(7, 3, 2, 2, 3))
-        return pc.DirectionalPerturbation(WIDE_DIRECTIONS, scale, pc.Affine(0.2 * normal(8, 3, 5), np.zeros((3, 5, 2, 2, 3))))
+        return pc.DirectionalPerturbation(
+            WIDE_DIRECTIONS, scale, pc.Affine(0.2 * normal(8, 3, 5), np.zeros((3, 5, 2, 2, 3)))
+        )
 
 
 class TestFunctionOfThePolicy(PerturbationContract):

@@ -44,14 +44,19 @@ Operator = Callable[[Array], Array]
 
 
 class Response(NamedTuple):
-    """A best response M (of least norm on affine sets) and whether it is the only one."""
+    """A best response M (of least norm on affine sets), whether it is the only one, and how far the deployed policy is
+    from being it: `residual`, the relative natural residual of the deployed policy in the world that it makes."""
 
     M: Array
     unique: Array
+    residual: Array
 
 
 class Quadratic(NamedTuple):
-    """C_T(·; M') as gradient(θ) = linear + hessian θ in the free parameters, with η = 1/‖hessian‖."""
+    """C_T(·; M') as gradient(θ) = linear + hessian θ in the free parameters, with η = 1/‖hessian‖.
+
+    Where the Hessian is held as a matrix, `gradient` is a product with it, not a pass over time.
+    """
 
     linear: Array
     gradient: Operator
@@ -93,7 +98,11 @@ def quadratic(problem: PerformativeProblem, world: CostToGo) -> Quadratic:
     size = math.prod(shape)
     if size <= DENSE_LIMIT:
         matrix = _hessian_matrix(problem, world, gradient, linear)
-        return Quadratic(linear, gradient, 1 / _largest_eigenvalue(matrix, dtype), matrix)
+
+        def product(M: Array) -> Array:
+            return linear + (matrix @ M.reshape(-1)).reshape(shape)
+
+        return Quadratic(linear, product, 1 / _largest_eigenvalue(matrix, dtype), matrix)
     return Quadratic(linear, gradient, 1 / _power_iteration(gradient, linear), None)
 
 
@@ -154,11 +163,11 @@ def _norm(M: Array) -> Array:
     return jnp.sqrt(jnp.sum(M**2))
 
 
-def natural_residual(problem: PerformativeProblem, M: Array, gradient: Array, form: Quadratic) -> Array:
-    """‖M - Proj(M - η g)‖_F relative to ‖M‖_F + η ‖g(0)‖_F, η = 1/‖Hessian‖."""
-    step = form.step
-    moved = _norm(M - problem.feasible_set.project(M - step * gradient))
-    scale = _norm(M) + step * _norm(form.linear)
+def natural_residual(problem: PerformativeProblem, world: CostToGo, M: Array, step: Array) -> Array:
+    """‖M - Proj(M - η g)‖_F relative to ‖M‖_F + η ‖g(0)‖_F, η = 1/‖Hessian‖; g by a pass over time of its own."""
+    at_zero, at_M = jax.vmap(_gradient_at(problem, world))(jnp.stack([jnp.zeros_like(M), M]))
+    moved = _norm(M - problem.feasible_set.project(M - step * at_M))
+    scale = _norm(M) + step * _norm(at_zero)
     return moved / jnp.where(scale > 0, scale, 1)
 
 
@@ -178,7 +187,7 @@ class _Affine:
     """The set is an affine subspace: one symmetric solve in its tangent space, least norm where singular."""
 
     def __init__(self, problem: PerformativeProblem, form: Quadratic):
-        self.form = form
+        self.form, self.step = form, form.step
         shape, dtype, size = form.linear.shape, form.linear.dtype, form.linear.size
         self.origin = problem.feasible_set.project(jnp.zeros(shape, dtype))
         self.unique = jnp.asarray(True)
@@ -253,11 +262,12 @@ class _Projected:
             return M, jnp.asarray(True)
 
         def improve(carry: Any) -> Any:
-            M, gap, count, _ = carry
+            M, gap, count, *_ = carry
             fallback = self.project(M - self.step * form.gradient(M))
             # The small shift keeps a singular Jacobian (a minimiser that is not unique) solvable.
-            system = self.jacobian(M) + eps * self.eye
-            newton = self.project(M - jnp.linalg.solve(system, self.residual(M).reshape(-1)).reshape(M.shape))
+            slope = self.jacobian(M)
+            right = self.residual(M).reshape(-1)
+            newton = self.project(M - jnp.linalg.solve(slope + eps * self.eye, right).reshape(M.shape))
             candidates = jnp.stack([newton, fallback])
             gaps = jax.vmap(lambda candidate: _norm(self.residual(candidate)))(candidates)
             best = jnp.where(gaps[0] <= gaps[1], 0, 1)  # the fallback where Newton is not finite
@@ -267,17 +277,17 @@ class _Projected:
                 jnp.minimum(gaps[best], gap),
                 count + 1,
                 ~improved,
+                slope,
             )
 
         def unsolved(carry: Any) -> Array:
-            M, gap, count, stuck = carry
-            return (gap > 4 * eps * self._scale(M)) & (count < NEWTON_STEPS) & ~stuck
+            M, gap, count, stuck, _ = carry
+            return (count == 0) | ((gap > 4 * eps * self._scale(M)) & (count < NEWTON_STEPS) & ~stuck)
 
-        first = (M, _norm(self.residual(M)), jnp.asarray(0), jnp.asarray(False))
-        M = jax.lax.while_loop(unsolved, improve, first)[0]
-        # On the active face the Hessian must be definite: the free part of the Jacobian has full rank.
-        gram = self.jacobian(M)
-        values = jnp.linalg.eigvalsh(gram @ gram.T)
+        first = (M, _norm(self.residual(M)), jnp.asarray(0), jnp.asarray(False), self.eye)
+        M, *_, slope = jax.lax.while_loop(unsolved, improve, first)
+        # On the active face the Hessian must be definite: the Jacobian has full rank.
+        values = jnp.linalg.eigvalsh(slope @ slope.T)
         return M, values[0] > (M.size * eps * 100) ** 2 * jnp.maximum(values[-1], 1)
 
     def _scale(self, M: Array) -> Array:
@@ -330,6 +340,8 @@ class _Separable:
         S_values, S_vectors = jnp.linalg.eigh(Sigma)
         self.regular = (G_values[0] > H * m * eps * G_values[-1]) & (S_values[0] > n * eps * S_values[-1])
         self.G_values = jnp.where(G_values > 0, G_values, 1)
+        largest = 2 * (G_values[-1] * S_values[-1] + jnp.trace(G_mean) * (w @ w))
+        self.step = 1 / jnp.maximum(largest, jnp.finfo(G.dtype).tiny)
         self.inverse_root = (S_vectors / jnp.sqrt(jnp.where(S_values > 0, S_values, 1))) @ S_vectors.T
         a = self.inverse_root @ w
         squared = a @ a
@@ -337,7 +349,23 @@ class _Separable:
         shift = jnp.where(self.regular, 0, 1) * jnp.eye(H * m, dtype=G.dtype)
         self.along = jax.scipy.linalg.cho_factor(G + squared * G_mean + shift, lower=True)
 
+        def dense() -> tuple[Array, Array]:
+            affine = _Affine(problem, quadratic(problem, world))
+            return affine.unique, affine.inverse
+
+        size = H * m * n
+        if size <= DENSE_LIMIT:
+            known = jnp.asarray(True), jnp.zeros((size, size), G.dtype)
+            self.unique, inverse = jax.lax.cond(self.regular, lambda: known, dense)
+            self.fallback = lambda gradient: -(inverse @ gradient.reshape(-1)).reshape(gradient.shape)
+        else:
+            self.unique = jnp.asarray(True)
+            self.fallback = lambda gradient: _Affine(problem, quadratic(problem, world)).solve(gradient)
+
     def solve(self, gradient: Array) -> Array:
+        return jax.lax.cond(self.regular, self._separately, self.fallback, gradient)
+
+    def _separately(self, gradient: Array) -> Array:
         H, m, n = self.shape
         right = -gradient.reshape(H * m, n) @ self.inverse_root / 2
         mean_part = right @ self.unit
@@ -348,28 +376,11 @@ class _Separable:
 
     def minimise(self, start: Array) -> tuple[Array, Array]:
         gradient = _gradient_at(self.problem, self.world)
-
-        def closed(start: Array) -> tuple[Array, Array]:
-            M = self.solve(gradient(jnp.zeros_like(start)))
-            return M + self.solve(gradient(M)), jnp.asarray(True)  # one step of iterative refinement
-
-        def dense(start: Array) -> tuple[Array, Array]:
-            return _Affine(self.problem, quadratic(self.problem, self.world)).minimise(start)
-
-        return jax.lax.cond(self.regular, closed, dense, start)
+        M = self.solve(gradient(jnp.zeros_like(start)))
+        return M + self.solve(gradient(M)), self.unique  # one step of iterative refinement
 
     def newton(self, M: Array) -> Operator:
-        def dense() -> _Affine:
-            return _Affine(self.problem, quadratic(self.problem, self.world))
-
-        if M.size > DENSE_LIMIT:
-            return lambda gradient: jax.lax.cond(self.regular, self.solve, lambda g: dense().solve(g), gradient)
-        size, dtype = M.size, M.dtype
-        # Worked out once, and only where it is needed.
-        inverse = jax.lax.cond(self.regular, lambda: jnp.zeros((size, size), dtype), lambda: dense().inverse)
-        return lambda gradient: jnp.where(
-            self.regular, self.solve(gradient), -(inverse @ gradient.reshape(-1)).reshape(gradient.shape)
-        )
+        return self.solve
 
 
 def _method(problem: PerformativeProblem, world: CostToGo) -> _Affine | _Projected | _Separable:
@@ -386,7 +397,10 @@ def respond(problem: PerformativeProblem, deployed: Array, start: Array | None =
     world, start = jax.lax.stop_gradient(
         (cost_to_go(problem, problem.structure.lift(deployed)), deployed if start is None else start)
     )
-    return Response(*jax.lax.stop_gradient(_method(problem, world).minimise(start)))
+    method = _method(problem, world)
+    return Response(
+        *jax.lax.stop_gradient((*method.minimise(start), natural_residual(problem, world, deployed, method.step)))
+    )
 
 
 def response_pushforward(problem: PerformativeProblem, deployed: Array, response: Array) -> Operator:
@@ -411,8 +425,7 @@ def differentiable_response(problem: PerformativeProblem, deployed: Array) -> Ar
 def residual_of(problem: PerformativeProblem, M: Array, deployed: Array) -> Array:
     """Relative natural residual; pure."""
     world = cost_to_go(problem, problem.structure.lift(deployed))
-    form = quadratic(problem, world)
-    return natural_residual(problem, M, form.gradient(M), form)
+    return natural_residual(problem, world, M, _method(problem, world).step)
 
 
 _compiled_respond = eqx.filter_jit(differentiable_response)

@@ -30,6 +30,7 @@ from perfcontrol.report.claims import Claim, as_markdown
 from perfcontrol.solvers import RRM, RSGD, Result, StablePoint, solve
 from perfcontrol.solvers.loop import State, run_steps
 
+CEILING = 1e30  # costs of runaway policies are astronomical: recorded as this
 CHUNK = 100  # iterations in one compiled call
 STARTS = 4  # further starts of the exact solver in each case
 DIMINISHING_OFFSET = 10.0  # η_n = step 10 / (n + 10)
@@ -94,10 +95,11 @@ class _Runner:
             yield state, visited[:, : steps - first]
 
     def costs(self, cases: Array, policies: Array) -> np.ndarray:
-        """Exact C_T(M; M) of every policy (run, step, ...)."""
+        """Exact C_T(M; M) of every policy (run, step, ...), `CEILING` where it is larger or overflows."""
         runs, steps = policies.shape[:2]
         flat = self._costs(jnp.repeat(cases, steps), policies.reshape(-1, *self.shape).astype(jnp.float32))
-        return np.asarray(flat, dtype=float).reshape(runs, steps)
+        values = np.asarray(flat, dtype=float).reshape(runs, steps)
+        return np.where(values < CEILING, values, CEILING)  # False for what is not finite
 
 
 def _starts(problems: PerformativeProblem, settings: ReproduceSettings, count: int) -> Array:
@@ -114,7 +116,9 @@ def _keys(settings: ReproduceSettings, stage: int, count: int) -> Array:
     return jax.random.split(jax.random.fold_in(jax.random.key(settings.seed), stage), count)
 
 
-def _problems(settings: ReproduceSettings, feasible_set: str, volatility: str = "lognormal") -> list[PerformativeProblem]:
+def _problems(
+    settings: ReproduceSettings, feasible_set: str, volatility: str = "lognormal"
+) -> list[PerformativeProblem]:
     """All cases, regime by regime, the three orders within."""
     return [
         stock_market(
@@ -145,7 +149,9 @@ def _by_case(values: list[Any]) -> np.ndarray:
 def exact_stage(settings: ReproduceSettings, feasible_set: str, progress: Progress) -> xarray.Dataset:
     """Stable points of all cases without sampling, with the evidence that they are such and the only ones."""
     problems = _problems(settings, feasible_set)
-    rows: dict[str, list[Any]] = {name: [] for name in ("M", "residual", "unique", "rate", "agreement", "cost", "spread")}
+    rows: dict[str, list[Any]] = {
+        name: [] for name in ("M", "residual", "unique", "rate", "agreement", "cost", "spread")
+    }
     starts = _starts(stack_problems(problems), settings, STARTS)
     for index, problem in enumerate(problems):
         stable = solve(problem, StablePoint(), throw=False)
@@ -191,7 +197,8 @@ def run_stage(
         target = exact["M"].sel(regime=regime).values[:, None, None]
         blocks = [starts[:, None]]
         final = None
-        for final, visited in runner.iterates(cases, starts, keys, rule, steps):
+        for state, visited in runner.iterates(cases, starts, keys, rule, steps):
+            final = state
             blocks.append(visited)
             progress("RSGD runs", (r + 0.5 * (len(blocks) - 1) * CHUNK / steps) / len(REGIMES))
         done = 0
@@ -207,7 +214,7 @@ def run_stage(
     dims = ("regime", "order", "seed")
     data = {
         "error": ((*dims, "step"), error, {"long_name": "squared Frobenius distance to the stable policy"}),
-        "cost": ((*dims, "step"), cost, {"long_name": "expected total cost C_T(M_n; M_n), exact, single precision"}),
+        "cost": ((*dims, "step"), cost, {"long_name": f"expected total cost C_T(M_n; M_n), exact up to rounding of single precision, at most {CEILING:g}"}),
         "result": (dims, result.astype(str), {"long_name": "how the run ended"}),
         "steps_taken": (dims, taken, {"long_name": "iterations until the run ended"}),
         "stable_policy": (("regime", "order", "row", "column"), exact["M"].values),
@@ -265,20 +272,19 @@ def sweep_stage(
     starts = _starts(runner.problems, settings, seeds)[seed]
     rule = _constant(jnp.asarray(step), len(step))
     cases = jnp.asarray(order + r * len(ORDERS))
-    final, visited = None, None
-    for count, (final, visited) in enumerate(
-        runner.iterates(cases, starts, _keys(settings, 4, len(step)), rule, settings.sweep_steps)
-    ):
+    state, last = None, None
+    keys = _keys(settings, 4, len(step))
+    for count, (state, last) in enumerate(runner.iterates(cases, starts, keys, rule, settings.sweep_steps)):  # noqa: B007
         progress("where divergence begins", (count + 1) * CHUNK / settings.sweep_steps)
-    assert final is not None and visited is not None
+    assert state is not None and last is not None
     target = exact["M"].sel(regime="unstable").values[order]
-    error = np.sum((np.asarray(visited)[:, -1, 0] - target) ** 2, axis=(-2, -1)).reshape(grid)
+    error = np.sum((np.asarray(last)[:, -1, 0] - target) ** 2, axis=(-2, -1)).reshape(grid)
     start = np.sum((np.asarray(starts)[:, 0] - target) ** 2, axis=(-2, -1)).reshape(grid)
     return xarray.Dataset(
         {
             "relative_error": (("order", "factor", "seed"), error / start),
             "threshold": (("order",), threshold),
-            "result": (("order", "factor", "seed"), _named(final, grid)[0].astype(str)),
+            "result": (("order", "factor", "seed"), _named(state, grid)[0].astype(str)),
         },
         coords={"order": list(ORDERS), "factor": factors, "seed": np.arange(seeds)},
     )

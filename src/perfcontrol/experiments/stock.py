@@ -14,7 +14,7 @@ from typing import Any, Literal
 import jax.numpy as jnp
 import numpy as np
 
-from perfcontrol._checks import fail
+from perfcontrol._checks import as_array, check_shape, fail
 from perfcontrol.costs import QuadraticCost
 from perfcontrol.perturbations import StockPerturbation
 from perfcontrol.problem import PerformativeProblem
@@ -76,6 +76,9 @@ def stock_market(
     References:
         Appendix A, Example 1 and the simulation paragraph after it.
     """
+    growth, investment = as_array("growth", growth), as_array("initial_investment", initial_investment)
+    for name, value in (("growth", growth), ("initial_investment", investment)):
+        check_shape(name, value, (), (), "Pass one number, the same for every stock.")
     if not 0 < float(trading_hours) < 24:
         raise fail("trading_hours", str(trading_hours), "lie between 0 and 24", "Hours per day.")
     exposure = float(trading_hours) / (24 - float(trading_hours))
@@ -93,8 +96,6 @@ def stock_market(
         memory=1,
         perturbation=StockPerturbation(stock_sensitivities(order), rate, exposure, volatility),
         feasible_set=sets[feasible_set],
-        initial_state=jnp.concatenate(
-            [jnp.zeros(STOCKS), jnp.full(STOCKS, 1.0) * jnp.asarray(initial_investment, dtype=float)]
-        ),
+        initial_state=jnp.concatenate([jnp.zeros(STOCKS), jnp.full(STOCKS, investment)]),
         structure=RepeatedBlock(2),
     )

@@ -86,11 +86,12 @@ class FinitePerturbation(AbstractPerturbation):
             raise fail("values", f"{self.values.shape}", required, "A single matrix V is passed as [V].")
         self.probabilities = as_policy_map("probabilities", probabilities)
         constant = self.probabilities
-        if not isinstance(constant, AbstractPolicyMap) and is_concrete(constant):
-            if constant.ndim == 0 or not bool(jnp.all(_is_distribution(constant))):
-                got = f"least entry {float(jnp.min(constant)):.3g} and sums {jnp.sum(constant, axis=-1)}"
-                required = "be nonnegative with sum one over the values"
-                raise fail("probabilities", got, required, "Divide them by their sum.")
+        if isinstance(constant, AbstractPolicyMap) or not is_concrete(constant):
+            return
+        if constant.ndim == 0 or not bool(jnp.all(_is_distribution(constant))):
+            got = f"least entry {float(jnp.min(constant)):.3g} and sums {jnp.sum(constant, axis=-1)}"
+            required = "be nonnegative with sum one over the values"
+            raise fail("probabilities", got, required, "Divide them by their sum.")
 
     @property
     def _count(self) -> int:

@@ -10,8 +10,7 @@ from perfcontrol.perturbations.base import AbstractPerturbation, CovarianceOpera
 
 
 class _ZeroDraws(Draws):
-    zeros: Array  # (T, 0): nothing to carry, but the horizon
-
+    zeros: Array  # (T, 1): carries the horizon, and an axis that batched loops can reshape
     size: int = eqx.field(static=True)
 
     @property
@@ -46,7 +45,7 @@ class NoPerturbation(AbstractPerturbation):
     """Δ_t = 0: ordinary linear-quadratic control with a disturbance-action policy."""
 
     def sample(self, key: Key[Array, ""], M: Array, horizon: int) -> Draws:
-        return _ZeroDraws(jnp.zeros((horizon, 0), M.dtype), M.shape[-1])
+        return _ZeroDraws(jnp.zeros((horizon, 1), M.dtype), M.shape[-1])
 
     def mean(self, M: Array, horizon: int) -> Array:
         return zero_mean(M, horizon, M.shape[-1])

@@ -20,6 +20,7 @@ class SampledPerturbation(AbstractPerturbation):
             policy. A plain function is static; numbers to sweep belong in an eqx.Module or jax.tree_util.Partial.
         bound: ξ_t ≥ ‖Δ_t‖ over the feasible set, a number or (T,), declared; None for unknown.
         sensitivity: ε_t in Wasserstein-1 distance per unit of Frobenius norm, declared likewise.
+        columns: p, the columns of a draw; None: found when the problem is built.
 
     Raises:
         InputError: negative numbers, or a sampler that does not fit (when the problem is built).
@@ -30,11 +31,11 @@ class SampledPerturbation(AbstractPerturbation):
     declared_sensitivity: Array | None
     width: int | None = eqx.field(static=True)
 
-    def __init__(self, sampler: Any, bound: Any = None, sensitivity: Any = None):
+    def __init__(self, sampler: Any, bound: Any = None, sensitivity: Any = None, columns: int | None = None):
         self.sampler = as_callable("sampler", sampler)
         self.declared_bound = _declared("bound", bound)
         self.declared_sensitivity = _declared("sensitivity", sensitivity)
-        self.width = None
+        self.width = columns
 
     def _shape(self, policy_shape: tuple[int, int, int]) -> tuple[int, ...]:
         policy = jax.ShapeDtypeStruct(policy_shape, jnp.result_type(float))
@@ -52,7 +53,7 @@ class SampledPerturbation(AbstractPerturbation):
     def resize(self, policy_shape: tuple[int, int, int], horizon: int) -> "SampledPerturbation":
         """This law knowing how many columns its draws have."""
         width = (*self._shape(policy_shape), policy_shape[-1])[2]
-        return eqx.tree_at(lambda law: law.width, self, width, is_leaf=lambda x: x is None)
+        return SampledPerturbation(self.sampler, self.declared_bound, self.declared_sensitivity, width)
 
     def columns(self, state_size: int, input_size: int) -> int:
         return state_size if self.width is None else self.width

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Key
 from scipy import special
 
-from perfcontrol._checks import as_array, check_shape, fail
+from perfcontrol._checks import as_array, check_shape, fail, is_concrete
 from perfcontrol._linalg import Diagonal
 from perfcontrol.perturbations.base import AbstractPerturbation, CovarianceOperator, Draws
 
@@ -130,7 +130,7 @@ class StockPerturbation(AbstractPerturbation):
 
     def __init__(self, sensitivities: Any, rate: Any, exposure: Any, volatility: str = "lognormal"):
         sensitivities = as_array("sensitivities", sensitivities)
-        if sensitivities.ndim != 1 or bool(jnp.any(sensitivities <= 0)):
+        if sensitivities.ndim != 1 or (is_concrete(sensitivities) and np.any(np.asarray(sensitivities) <= 0)):
             raise fail("sensitivities", f"{sensitivities.shape}", "be positive numbers (T,)", "One per day.")
         if volatility not in VOLATILITIES:
             raise fail("volatility", repr(volatility), f"be one of {VOLATILITIES}", "Pass one of these names.")

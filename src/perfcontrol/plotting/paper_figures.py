@@ -126,11 +126,22 @@ def figure_cure(cure: xarray.Dataset, sweep: xarray.Dataset, settings: Reproduce
     away = ((sweep["relative_error"] > 1) | (sweep["result"] != "success")).mean("seed")
     for order, colour in ORDER_COLOURS.items():
         right.plot(
-            sweep["factor"], 100 * away.sel(order=order), color=colour, marker=ORDER_MARKS[order], markersize=4, label=order
+            sweep["factor"],
+            100 * away.sel(order=order),
+            color=colour,
+            marker=ORDER_MARKS[order],
+            markersize=4,
+            label=order,
         )
     right.axvline(1, color="#555555", linestyle=(0, (4, 3)), linewidth=1)
     right.annotate(
-        "mean-square\nthreshold", (1, 100), xytext=(-4, -4), textcoords="offset points", ha="right", va="top", color="#555555"
+        "mean-square\nthreshold",
+        (1, 100),
+        xytext=(-4, -4),
+        textcoords="offset points",
+        ha="right",
+        va="top",
+        color="#555555",
     )
     right.set_xscale("log")
     ticks = [0.25, 0.5, 1, 2, 3]

@@ -34,9 +34,7 @@ def bootstrap(
 ) -> tuple[float, tuple[float, float]]:
     """A statistic of rows (seed, ...) and its percentile interval over resampled seeds."""
     generator = np.random.default_rng(seed)
-    draws = [
-        statistic(samples[generator.integers(0, len(samples), len(samples))]) for _ in range(count)
-    ]
+    draws = [statistic(samples[generator.integers(0, len(samples), len(samples))]) for _ in range(count)]
     tail = 50 * (1 - level)
     low, high = np.percentile(draws, [tail, 100 - tail])
     return float(statistic(samples)), (float(low), float(high))

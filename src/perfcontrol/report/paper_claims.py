@@ -50,8 +50,10 @@ def _worst(values: dict[str, tuple[float, tuple[float, float]]]) -> tuple[str, f
 
 
 def _listed(values: dict[str, Any]) -> str:
-    """"ascending 0.1, descending 0.2, ..."."""
-    return ", ".join(f"{order} {value[0] if isinstance(value, tuple) else value:.3g}" for order, value in values.items())
+    """ "ascending 0.1, descending 0.2, ..."."""
+    return ", ".join(
+        f"{order} {value[0] if isinstance(value, tuple) else value:.3g}" for order, value in values.items()
+    )
 
 
 def _relative_error(runs: xarray.Dataset, regime: str, order: str) -> np.ndarray:

@@ -50,7 +50,8 @@ class Box(AbstractSet):
     def project(self, M: Array) -> Array:
         low, high = self.low.astype(M.dtype), self.high.astype(M.dtype)
         # Not `clip`: an entry that two equal bounds fix must have derivative zero there as well.
-        return jnp.where((M > low) & (M < high), M, jnp.where(M <= low, low, high))
+        inside = (low < M) & (high > M)
+        return jnp.where(inside, M, jnp.where(low >= M, low, high))
 
     def support(self, direction: Array) -> Array | None:
         """Σ max(low d, high d); None where a bound is infinite."""

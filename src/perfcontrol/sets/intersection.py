@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from perfcontrol._checks import fail, is_concrete
-from perfcontrol._linalg import symmetrise
+from perfcontrol._linalg import symmetrise, transpose
 from perfcontrol.sets.base import AbstractSet
 
 SWEEPS = 20  # of Dykstra between two Newton steps
@@ -68,32 +68,31 @@ class _Linearised:
     """
 
     def __init__(self, sets: Sets, split: _Split, shape: tuple[int, ...]):
-        size, dtype = split.x.size, split.x.dtype
-        eps = float(jnp.finfo(dtype).eps)
-        inverses, normals = [], []
+        eps = float(jnp.finfo(split.x.dtype).eps)
+        eye = jnp.eye(split.x.size, dtype=split.x.dtype)
+        slopes = []
         for member, part in zip(sets, split.parts, strict=True):
 
             def flat(z: Array, member: AbstractSet = member) -> Array:
                 return member.project(z.reshape(shape)).reshape(-1)
 
-            values, vectors = jnp.linalg.eigh(symmetrise(jax.jacfwd(flat)(split.x + part)))
-            kept = values > 1e3 * eps
-            inverses.append((vectors * jnp.where(kept, 1 / jnp.where(kept, values, 1), 0)) @ vectors.T)
-            normals.append((vectors * ~kept) @ vectors.T)
-        self.inverses, self.normals = jnp.stack(inverses), jnp.stack(normals)
+            slopes.append(jax.jacfwd(flat)(split.x + part))
+        values, vectors = jnp.linalg.eigh(symmetrise(jnp.stack(slopes)))
+        kept = (values > 1e3 * eps)[:, None, :]
+        self.inverses = (vectors * jnp.where(kept, 1 / jnp.where(kept, values[:, None, :], 1), 0)) @ transpose(vectors)
+        self.normals = (vectors * ~kept) @ transpose(vectors)
         values, vectors = jnp.linalg.eigh(jnp.sum(self.normals, axis=0))
         fixed = values > 1e4 * eps
         self.held = (vectors * jnp.where(fixed, 1 / jnp.where(fixed, values, 1), 0)) @ vectors.T
         self.free = (vectors * ~fixed) @ vectors.T
-        eye = jnp.eye(size, dtype=dtype)
         self.metric = eye + jnp.sum(self.inverses + self.normals - eye, axis=0)
-        self.system = jax.scipy.linalg.lu_factor(self.free @ self.metric @ self.free + eye - self.free)
+        self.system = jax.scipy.linalg.cho_factor(self.free @ self.metric @ self.free + eye - self.free)
 
     def move(self, errors: Float[Array, "k p"], dy: Float[Array, " p"]) -> Array:
         """dx."""
         held = self.held @ jnp.einsum("kab,kb->a", self.normals, errors)
         right = dy + jnp.einsum("kab,kb->a", self.inverses, errors) - self.metric @ held
-        return held + self.free @ jax.scipy.linalg.lu_solve(self.system, self.free @ right)
+        return held + self.free @ jax.scipy.linalg.cho_solve(self.system, self.free @ right)
 
     def parts(self, errors: Float[Array, "k p"], dx: Array, dy: Array) -> Float[Array, "k p"]:
         """dp_i, the undetermined components shared out evenly."""
@@ -127,7 +126,9 @@ def _solve(sets: Sets, M: Array) -> _Split:
 
     def improve(carry: tuple[_Split, Array]) -> tuple[_Split, Array]:
         split, count = carry
-        x, parts = jax.lax.fori_loop(0, SWEEPS, lambda _, now: _sweep(sets, *now, shape), (split.x, split.parts))
+        x, parts = jax.lax.fori_loop(
+            0, SWEEPS, lambda _, now: _sweep(sets, now[0], now[1], shape), (split.x, split.parts)
+        )
         split = _split(sets, x, parts, shape)
         if y.size <= NEWTON_LIMIT:
             linear = _Linearised(sets, split, shape)
@@ -194,7 +195,7 @@ def _project_derivative(primals: tuple[Sets, Array], tangents: tuple[Any, Array 
 
 @eqx.filter_jit
 def _support(sets: Sets, direction: Array, reach: Array) -> Array:
-    """sup <direction, M> by two proximal steps of length t from 0: x' = P(x + t d) has sup - <d, x'> ≤ ‖x' - x‖ 2R/t."""
+    """sup <direction, M> by two proximal steps from 0: x' = P(x + t d) leaves a gap of at most ‖x' - x‖ 2R/t."""
     norm = jnp.sqrt(jnp.sum(direction**2))
     unit = direction / jnp.where(norm > 0, norm, 1)
     length = (1e5 if direction.dtype == jnp.float64 else 1e3) * reach

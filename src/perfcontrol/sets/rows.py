@@ -3,6 +3,7 @@
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from perfcontrol._checks import as_array, fail, is_concrete
@@ -62,10 +63,10 @@ class RowSimplex(_Rows):
 
     def __init__(self, total: Any):
         self.total = as_array("total", total)
-        if is_concrete(self.total) and bool(jnp.any(self.total < 0)):
+        if is_concrete(self.total) and np.any(np.asarray(self.total) < 0):
             raise fail(
                 "total",
-                f"{float(jnp.min(self.total))}",
+                f"{float(np.min(self.total))}",
                 "be nonnegative: the set is empty",
                 "Nonnegative entries cannot have a negative sum.",
             )

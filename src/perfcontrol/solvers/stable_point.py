@@ -13,8 +13,8 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from perfcontrol._checks import check_integer, check_tolerance
-from perfcontrol.evaluate.best_response import natural_residual, quadratic, respond, response_pushforward
-from perfcontrol.evaluate.exact import cost_to_go, require_moments
+from perfcontrol.evaluate.best_response import Response, respond, response_pushforward
+from perfcontrol.evaluate.exact import require_moments
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.solvers.loop import AbstractSolver, State, start
 from perfcontrol.solvers.result import Result
@@ -31,6 +31,7 @@ class _Own(eqx.Module):
     gap: Array  # ‖Φ(M) - M‖
     ratio: Array  # of the last two gaps
     unique: Array
+    residual: Array  # relative natural residual of M
     limit: Array  # of ‖M‖
 
 
@@ -62,11 +63,9 @@ class StablePoint(AbstractSolver):
         check_tolerance(self.tolerance, problem.dtype)
 
     def init(self, problem: PerformativeProblem, M0: Array) -> State:
-        response = respond(problem, M0)
-        gap = frobenius(response.M - M0)
-        # A first step of repeated minimisation is always worth taking.
-        limit = FAR * (1 + frobenius(M0) + frobenius(response.M))
-        return start(M0, _Own(response.M, gap, jnp.zeros((), M0.dtype), response.unique, limit))
+        # The first step moves nowhere and evaluates M0: one place that compiles the best response.
+        far = jnp.asarray(jnp.inf, M0.dtype)
+        return start(M0, _Own(M0, far, jnp.zeros((), M0.dtype), jnp.asarray(True), far, far))
 
     def step(self, problem: PerformativeProblem, state: State, key: Array | None) -> State:
         own = state.own
@@ -83,17 +82,20 @@ class StablePoint(AbstractSolver):
             length, count, *_ = carry
             M = problem.feasible_set.project(state.M + length * direction)
             response = respond(problem, M)
-            return length / 2, count + 1, M, response.M, frobenius(response.M - M), response.unique
+            return length / 2, count + 1, M, response, frobenius(response.M - M)
 
         def unaccepted(carry: Any) -> Array:
-            _, count, M, _, gap, _ = carry
+            _, count, M, _, gap = carry
             return (count == 0) | (~contracting & ~helps(M, gap) & (count < HALVINGS))
 
         one = jnp.ones((), F.dtype)
-        trial = (one, jnp.asarray(0), state.M, own.response, own.gap, own.unique)
-        _, _, M, response, gap, unique = jax.lax.while_loop(unaccepted, try_length, trial)
+        known = Response(own.response, own.unique, own.residual)
+        _, _, M, response, gap = jax.lax.while_loop(
+            unaccepted, try_length, (one, jnp.asarray(0), state.M, known, own.gap)
+        )
         finite = jnp.isfinite(gap) & jnp.all(jnp.isfinite(M))
-        ratio = gap / jnp.where(own.gap > 0, own.gap, 1)
+        ratio = gap / jnp.where(own.gap > 0, own.gap, 1)  # zero at the first step: a step of minimisation follows
+        limit = jnp.where(state.steps == 0, FAR * (1 + frobenius(M) + frobenius(response.M)), own.limit)
         tolerance = check_tolerance(self.tolerance, problem.dtype)
         scale = frobenius(M)
         done = gap <= 0.1 * tolerance * jnp.where(scale > 0, scale, 1)
@@ -102,22 +104,19 @@ class StablePoint(AbstractSolver):
         result = Result.where(done | stalled, Result.success, Result.running)
         result = Result.where(finite, result, Result.nonfinite)
         good = finite & ~stalled
-        following = _Own(response, gap, ratio, unique, own.limit)
+        following = _Own(response.M, gap, ratio, response.unique, response.residual, limit)
         kept = jax.tree.map(lambda new, old: jnp.where(good, new, old), following, own)
         return State(jnp.where(good, M, state.M), state.steps + 1, result, kept)
 
     def finish(self, problem: PerformativeProblem, state: State, stopped: bool) -> tuple[Result, dict[str, Array]]:
         tolerance = check_tolerance(self.tolerance, problem.dtype)
-        world = cost_to_go(problem, problem.structure.lift(state.M))
-        form = quadratic(problem, world)
-        residual = natural_residual(problem, state.M, form.gradient(state.M), form)
         unfinished = Result.running if stopped else Result.not_converged
         result = Result.where(
-            residual <= tolerance,
+            state.own.residual <= tolerance,
             Result.success,
             Result.where(state.result == Result.nonfinite, Result.nonfinite, unfinished),
         )
-        return result, {"residual": residual, "unique": state.own.unique, "rate": state.own.ratio}
+        return result, {"residual": state.own.residual, "unique": state.own.unique, "rate": state.own.ratio}
 
 
 def _newton_direction(problem: PerformativeProblem, M: Array, response: Array) -> Array:

@@ -62,7 +62,10 @@ def without_reaction(problem: PerformativeProblem) -> PerformativeProblem:
     if mean.shape[-1] == n + m:
         B = B + mean[..., n:]
     return eqx.tree_at(
-        lambda p: (p.system, p.perturbation), problem, (LinearSystem(A, B), NoPerturbation()), is_leaf=lambda x: x is None
+        lambda p: (p.system, p.perturbation),
+        problem,
+        (LinearSystem(A, B), NoPerturbation()),
+        is_leaf=lambda x: x is None,
     )
 
 

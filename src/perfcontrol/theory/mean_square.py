@@ -29,9 +29,7 @@ DEFAULT_SEED = 20241
 Map = Callable[[np.ndarray], np.ndarray]
 
 
-def leading_eigenvalue(
-    operator: Map, size: int, tolerance: float = 1e-4, limit: int = 200
-) -> tuple[float, np.ndarray]:
+def leading_eigenvalue(operator: Map, size: int, tolerance: float = 1e-4, limit: int = 200) -> tuple[float, np.ndarray]:
     """Spectral radius of a positive map on symmetric matrices, with its positive semidefinite eigenvector."""
     X, value = np.eye(size) / size, 0.0
     for _ in range(limit):
@@ -198,9 +196,7 @@ def stability_at(
     return result(min(1 / radius, mean_threshold), error / radius)
 
 
-def _bisected(
-    result: Callable[..., MeanSquareStability], squares: list[Map], high: float
-) -> MeanSquareStability:
+def _bisected(result: Callable[..., MeanSquareStability], squares: list[Map], high: float) -> MeanSquareStability:
     """The threshold by bisection on ρ(𝓛_η); its spread over the two halves of the samples as the error."""
 
     def threshold(stability: MeanSquareStability) -> float:

@@ -116,7 +116,5 @@ class JacobianSamples:
     def _images(self, X: np.ndarray, transposed: bool) -> np.ndarray:
         values, vectors = np.linalg.eigh((X + X.T) / 2)
         probes = self.normal @ (vectors * np.sqrt(np.maximum(values, 0))).T
-        products = _products(
-            self.problem, self.M, self.basis, self.keys, jnp.asarray(probes, self.M.dtype), transposed
-        )
+        products = _products(self.problem, self.M, self.basis, self.keys, jnp.asarray(probes, self.M.dtype), transposed)
         return np.asarray(products, dtype=float)

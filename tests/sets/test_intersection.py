@@ -1,0 +1,185 @@
+import cvxpy as cp
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import perfcontrol as pc
+from perfcontrol.sets import intersection
+from tests.contracts.feasible_set import SetContract
+from tests.tools import assert_close, assert_refused, normal, tolerance
+
+MASK = np.array([[True, True, False], [False, True, True]])
+
+
+class TestRowSumAndBox(SetContract):
+    def feasible_set(self):
+        return pc.Intersection([pc.Box(0.0, 0.6), pc.RowSum(1.0)])
+
+    def constraints(self, M):
+        return [cp.sum(lag, axis=1) == 1 for lag in M] + [lag >= 0 for lag in M] + [lag <= 0.6 for lag in M]
+
+
+class TestRowSumAndSupport(SetContract):
+    """Affine: one Newton step is exact."""
+
+    def feasible_set(self):
+        return pc.Intersection([pc.RowSum(0.5), pc.Support(MASK)])
+
+    def constraints(self, M):
+        return [cp.sum(lag, axis=1) == 0.5 for lag in M] + [cp.multiply(~MASK, lag) == 0 for lag in M]
+
+
+class TestSpectralBallBoxAndRowSum(SetContract):
+    def feasible_set(self):
+        return pc.Intersection([pc.SpectralBall(1.2), pc.Intersection([pc.Box(-0.5, 0.5), pc.RowSum(0.3)])])
+
+    def constraints(self, M):
+        sums = [cp.sum(lag, axis=1) == 0.3 for lag in M]
+        return [cp.sigma_max(cp.hstack(M)) <= 1.2, *sums, *[cp.abs(lag) <= 0.5 for lag in M]]
+
+
+class TestTwoBalls(SetContract):
+    def feasible_set(self):
+        return pc.Intersection((pc.SpectralBall(0.8), pc.FrobeniusBall(1.0)))
+
+    def constraints(self, M):
+        return [cp.sigma_max(cp.hstack(M)) <= 0.8, cp.norm(cp.vstack(M), "fro") <= 1.0]
+
+
+class TestSimplexAsAnIntersection(SetContract):
+    """Two unbounded sets with a bounded intersection."""
+
+    def feasible_set(self):
+        return pc.Intersection([pc.RowSum(1.0), pc.Box(0.0, np.inf)])
+
+    def constraints(self, M):
+        return [cp.sum(lag, axis=1) == 1 for lag in M] + [lag >= 0 for lag in M]
+
+    @pytest.mark.float32
+    def test_projection_matches_the_simplex(self):
+        points, projected = self.projected()
+        expected = jax.vmap(pc.RowSimplex(1.0).project)(jnp.asarray(points))
+        assert_close(projected, expected, 1e-12, 1e-4)
+
+
+@pytest.mark.parametrize("scale", [30.0, 3000.0])
+def test_intersection_projection_satisfies_its_variational_inequality_far_outside(scale):
+    """Dykstra alone would need about `scale` sweeps: here the promise of 1e-8 holds all the same."""
+    feasible_set = TestSpectralBallBoxAndRowSum().feasible_set()
+    inside = jax.vmap(feasible_set.project)(normal(1, 20, 2, 2, 3))
+    points = scale * normal(2, 5, 2, 2, 3)
+    for point, nearest in zip(points, jax.vmap(feasible_set.project)(points), strict=True):
+        assert all(bool(member.contains(nearest, 1e-8)) for member in feasible_set.sets)
+        gaps = jnp.sum((point - nearest) * (inside - nearest), axis=(1, 2, 3))
+        assert float(jnp.max(gaps)) <= 1e-8 * scale
+
+
+def test_intersection_without_newton_steps_still_converges(monkeypatch):
+    """Above the size limit Dykstra works alone."""
+    feasible_set, M = pc.Intersection([pc.FrobeniusBall(1.3), pc.RowSimplex(1.0)]), normal(3, 1, 2, 3)
+    expected = feasible_set.project(M)
+    jax.clear_caches()
+    monkeypatch.setattr(intersection, "NEWTON_LIMIT", 0)
+    assert_close(feasible_set.project(M), expected, 1e-8)
+    jax.clear_caches()
+
+
+def test_intersection_projection_differentiates_in_the_parameters_of_its_sets():
+    M, step = 2 * normal(4, 2, 2, 3), 1e-6
+
+    def moved(radius, total):
+        return jnp.sum(pc.Intersection([pc.SpectralBall(radius), pc.RowSum(total)]).project(M) * M)
+
+    for argnum in (0, 1):
+        ends = [
+            jax.jit(moved)(*(v + sign * step * (i == argnum) for i, v in enumerate((1.0, 0.4)))) for sign in (1, -1)
+        ]
+        assert_close(jax.grad(moved, argnum)(1.0, 0.4), (ends[0] - ends[1]) / (2 * step), 1e-7)
+
+
+def test_intersection_projects_under_jit_of_the_set_without_recompiling():
+    traces = []
+
+    @jax.jit
+    def project(radius, M):
+        traces.append(None)
+        return pc.Intersection([pc.FrobeniusBall(radius), pc.RowSum(0.2)]).project(M)
+
+    M = normal(5, 1, 2, 2)
+    for radius in (0.5, 1.0, 2.0):
+        expected = pc.Intersection([pc.FrobeniusBall(radius), pc.RowSum(0.2)]).project(M)
+        assert_close(project(radius, M), expected, 1e-12, 1e-5)
+    assert len(traces) == 1
+
+
+@pytest.mark.float32
+def test_intersection_of_one_set_is_that_set():
+    ball, M = pc.FrobeniusBall(0.5), normal(6, 1, 2, 3)
+    alone = pc.Intersection([ball])
+    assert_close(alone.project(M), ball.project(M), 0, 0)
+    assert_close(alone.support(M), ball.support(M), 0, 0)
+
+
+def test_intersection_keeps_what_its_sets_know():
+    both = pc.Intersection([pc.Box(0.0, 2.0), pc.RowSum(1.0)])
+    assert both.nonnegative and float(both.row_total) == 1 and not both.affine
+    assert float(both.radius((2, 2, 3))) == pytest.approx(2.0)  # four rows of sum one
+    assert pc.Intersection([pc.RowSum(1.0), pc.Support(MASK)]).affine
+
+
+@pytest.mark.float32
+def test_best_response_on_an_intersection_equals_that_on_the_same_set_written_as_one():
+    from tests.solvers.problems import drifting
+
+    deployed = pc.RowSimplex(0.5).project(normal(7, 2, 2, 3))
+    expected = pc.best_response(drifting(0, pc.RowSimplex(0.5)), deployed)
+    written = pc.Intersection([pc.RowSum(0.5), pc.Box(0.0, 9.0)])
+    assert_close(pc.best_response(drifting(0, written), deployed), expected, tolerance(1e-9, 1e-3))
+
+
+REFUSED = {
+    "row sums against a box": (
+        lambda: pc.Intersection([pc.RowSum(1.0), pc.Box(0.0, 0.2)]).check((1, 2, 3)),
+        "sets",
+        "empty",
+    ),
+    "ball against row sums": (
+        lambda: pc.Intersection([pc.FrobeniusBall(0.1), pc.RowSum(5.0)]).check((1, 2, 2)),
+        "sets",
+        "empty",
+    ),
+    "boxes apart, at once": (
+        lambda: pc.Intersection([pc.Box(np.zeros((1, 2, 2)), 1.0), pc.Box(2.0, 3.0)]),
+        "sets",
+        "empty",
+    ),
+    "two totals": (lambda: pc.Intersection([pc.RowSum(1.0), pc.RowSum(2.0)]).check((1, 2, 2)), "sets", "empty"),
+    "no set": (lambda: pc.Intersection([]), "sets", "at least one"),
+    "not a list": (lambda: pc.Intersection(pc.RowSum(1.0)), "sets", "sequence"),
+    "misfit of a member": (
+        lambda: pc.Intersection([pc.Support(MASK), pc.RowSum(1.0)]).check((1, 2, 2)),
+        "mask",
+        "(2, 3)",
+    ),
+    "when the problem is built": (
+        lambda: _problem(pc.Intersection([pc.RowSum(1.0), pc.Box(0.0, 0.2)])),
+        "sets",
+        "empty",
+    ),
+}
+
+
+def _problem(feasible_set):
+    return pc.PerformativeProblem(
+        system=pc.LinearSystem(np.eye(2), np.eye(2)),
+        horizon=3,
+        noise=pc.Rademacher(1.0),
+        cost=pc.QuadraticCost(np.eye(2), np.eye(2)),
+        feasible_set=feasible_set,
+    )
+
+
+@pytest.mark.parametrize("case", REFUSED.values(), ids=REFUSED.keys())
+def test_intersection_is_refused_with_a_four_part_error(case):
+    assert_refused(*case)
