@@ -5,6 +5,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import jaxtyping
 import numpy as np
 import pytest
 
@@ -65,8 +66,13 @@ def random_psd(seed: int, size: int, *leading: int) -> jax.Array:
 
 def assert_refused(build: Callable[[], Any], name: str, *words: str) -> None:
     """`build` raises the four-part error about `name`: what is required, what was got, what to do; `words` occur."""
-    with pytest.raises(pc.InputError) as caught:
-        build()
+    disabled = jaxtyping.config.jaxtyping_disable
+    jaxtyping.config.update("jaxtyping_disable", True)  # else annotations may refuse a wrong type first
+    try:
+        with pytest.raises(pc.InputError) as caught:
+            build()
+    finally:
+        jaxtyping.config.update("jaxtyping_disable", disabled)
     text = str(caught.value)
     assert text.startswith(f"`{name}` must "), text
     required, _, rest = text.removeprefix(f"`{name}` must ").partition("; got ")

@@ -75,6 +75,16 @@ from perfcontrol.solvers import (
     solve,
 )
 from perfcontrol.systems import LinearSystem, design_gain
+from perfcontrol.theory import (
+    Certificate,
+    certify,
+    estimate_sensitivity,
+    rrm_error_bound,
+    rsgd_error_bound,
+    safe_step,
+    strong_stability,
+    theorem_step_size,
+)
 
 __all__ = [
     "RRM",
@@ -87,6 +97,7 @@ __all__ = [
     "AbstractStructure",
     "Affine",
     "Box",
+    "Certificate",
     "Constant",
     "ConvexCost",
     "DensePerturbation",
@@ -130,8 +141,10 @@ __all__ = [
     "Unconstrained",
     "Uniform",
     "best_response",
+    "certify",
     "design_gain",
     "estimate_cost",
+    "estimate_sensitivity",
     "expected_cost",
     "expected_cost_by_moments",
     "expected_gradient",
@@ -139,8 +152,13 @@ __all__ = [
     "path_gradient",
     "recover_noise",
     "residual",
+    "rrm_error_bound",
+    "rsgd_error_bound",
+    "safe_step",
     "sample_gradient",
     "simulate",
     "solve",
     "state_moments",
+    "strong_stability",
+    "theorem_step_size",
 ]

@@ -4,7 +4,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-REGIMES = {"stable": 0.9, "unstable": 1.0, "general": 0.98}  # growth ρ in A = ρ I
+REGIMES = {"stable": 0.9, "unstable": 1.0, "general": 0.96}  # growth ρ in A = ρ I
 
 
 class ReproduceSettings(BaseModel):
@@ -23,12 +23,13 @@ class ReproduceSettings(BaseModel):
     initial_investment: float = Field(150.0, gt=0, description="q_1 of every stock")
     rate: float = Field(0.05, description="riskless rate over the horizon")
     trading_hours: float = Field(6.5, gt=0, lt=24, description="h, trading hours a day")
-    cure_steps: int = Field(3000, ge=100, description="iterations of the runs that show what cures divergence")
+    cure_seeds: int = Field(16, ge=2, description="runs of each case that show what cures divergence")
+    cure_steps: int = Field(3000, ge=100, description="iterations of those with a diminishing step")
     sweep_seeds: int = Field(8, ge=2, description="runs per step size in the search for where divergence begins")
-    sweep_steps: int = Field(600, ge=50, description="iterations of each of those")
+    sweep_steps: int = Field(400, ge=50, description="iterations of each of those")
     seed: int = Field(0, ge=0, description="root of all randomness")
 
     @classmethod
     def quick(cls) -> "ReproduceSettings":
         """Small enough to end within seconds; the verdicts are then computed from little data."""
-        return cls(seeds=4, steps=200, cure_steps=300, sweep_seeds=2, sweep_steps=100)
+        return cls(seeds=4, steps=200, cure_seeds=4, cure_steps=300, sweep_seeds=2, sweep_steps=100)

@@ -83,19 +83,19 @@ class PerformativeProblem(eqx.Module):
         self.cost = _instance("cost", cost, AbstractCost, "Build it with pc.QuadraticCost(Q, R).")
         self.perturbation = _instance(
             "perturbation",
-            perturbation or NoPerturbation(),
+            NoPerturbation() if perturbation is None else perturbation,
             AbstractPerturbation,
             "Subclass AbstractPerturbation.",
         )
         self.feasible_set = _instance(
             "feasible_set",
-            feasible_set or Unconstrained(),
+            Unconstrained() if feasible_set is None else feasible_set,
             AbstractSet,
             "Pass for example pc.FrobeniusBall(1.0).",
         )
         self.structure = _instance(
             "structure",
-            structure or FullStructure(),
+            FullStructure() if structure is None else structure,
             AbstractStructure,
             "Pass for example pc.RepeatedBlock(2).",
         )

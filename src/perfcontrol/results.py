@@ -29,6 +29,13 @@ def written_whole(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+def check_writable(folder: Path) -> None:
+    """Make the folder and write a file in it, so that OSError comes before the work and not after it."""
+    with written_whole(folder / ".probe"):
+        pass
+    (folder / ".probe").unlink()
+
+
 def versions() -> dict[str, str]:
     """What the numbers depend on."""
     names = ("perfcontrol", "jax", "jaxlib", "numpy", "equinox")

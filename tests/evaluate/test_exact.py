@@ -188,7 +188,7 @@ def test_best_policy_approaches_the_lqr_optimum_as_the_memory_grows():
         )
         best = pc.best_response(problem, np.zeros(problem.policy_shape))
         gaps.append(float(pc.expected_cost(problem, best)) / optimum - 1)
-    assert gaps[0] > 0.01 and 0 < gaps[1] < 1e-3
+    assert gaps[0] > 0.01 and 0 < gaps[1] < 0.1 * gaps[0]
 
 
 MEAN, EPSILON, DEVIATION = 10.0, 0.9, 0.1

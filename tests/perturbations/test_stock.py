@@ -1,6 +1,7 @@
 """The paper's stock market."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.integrate
@@ -82,11 +83,11 @@ def test_stock_moments_match_their_closed_form():
     """E V = g₁ (row sums), Cov V = (g₂ - g₁²) (portfolio portfolioᵀ) on the diagonals of Δ's blocks."""
     law = pc.StockPerturbation(SENSITIVITIES, 0.05, EXPOSURE)
     block = np.abs(np.asarray(normal(1, 1, 3, 3)))
-    M = pc.RepeatedBlock(2).lift(block)
+    M = pc.RepeatedBlock(2).lift(jnp.asarray(block))
     portfolio = block[0] / EXPOSURE
     g1, g2 = growth_moments(np.log(SENSITIVITIES), 0.05, "lognormal")
     mean = law.mean(M, 3)
-    X, Y = np.asarray(normal(2, 6, 6)), np.asarray(normal(3, 6, 6))
+    X, Y = normal(2, 6, 6), normal(3, 6, 6)
     applied, pulled = law.covariance(M, 3).apply(X), law.covariance(M, 3).adjoint(Y)
     for t in range(3):
         assert_close(mean[t], np.diag(np.tile(g1[t] * portfolio.sum(axis=1) - 1, 2)))
@@ -100,7 +101,7 @@ def test_stock_moments_match_their_closed_form():
 def test_as_printed_volatility_has_next_to_no_variance():
     """The Gaussian of the paper's sensitivities is below the clip: v = -0.6, and nothing reacts."""
     law = pc.StockPerturbation([0.001, 0.05, 0.1], 0.05, EXPOSURE, "as_printed")
-    M = pc.RepeatedBlock(2).lift(np.full((1, 3, 3), EXPOSURE / 3))
+    M = pc.RepeatedBlock(2).lift(jnp.full((1, 3, 3), EXPOSURE / 3))
     drawn = np.asarray(law.sample(jax.random.key(0), M, 3).dense())
     assert np.abs(drawn - np.asarray(law.mean(M, 3))).max() < 1e-9
 

@@ -39,6 +39,7 @@ class TestSpectralBallBoxAndRowSum(SetContract):
         return [cp.sigma_max(cp.hstack(M)) <= 1.2, *sums, *[cp.abs(lag) <= 0.5 for lag in M]]
 
 
+@pytest.mark.slow
 class TestTwoBalls(SetContract):
     def feasible_set(self):
         return pc.Intersection((pc.SpectralBall(0.8), pc.FrobeniusBall(1.0)))
@@ -47,20 +48,13 @@ class TestTwoBalls(SetContract):
         return [cp.sigma_max(cp.hstack(M)) <= 0.8, cp.norm(cp.vstack(M), "fro") <= 1.0]
 
 
-class TestSimplexAsAnIntersection(SetContract):
-    """Two unbounded sets with a bounded intersection."""
-
-    def feasible_set(self):
-        return pc.Intersection([pc.RowSum(1.0), pc.Box(0.0, np.inf)])
-
-    def constraints(self, M):
-        return [cp.sum(lag, axis=1) == 1 for lag in M] + [lag >= 0 for lag in M]
-
-    @pytest.mark.float32
-    def test_projection_matches_the_simplex(self):
-        points, projected = self.projected()
-        expected = jax.vmap(pc.RowSimplex(1.0).project)(jnp.asarray(points))
-        assert_close(projected, expected, 1e-12, 1e-4)
+@pytest.mark.float32
+def test_two_unbounded_sets_that_make_a_simplex_project_and_support_like_it():
+    written, simplex = pc.Intersection([pc.RowSum(1.0), pc.Box(0.0, np.inf)]), pc.RowSimplex(1.0)
+    points = jnp.concatenate([scale * normal(8, 3, 2, 2, 3) for scale in (0.1, 1.0, 10.0)])
+    assert_close(jax.vmap(written.project)(points), jax.vmap(simplex.project)(points), 1e-12, 1e-4)
+    assert_close(written.support(points), simplex.support(points), 1e-8, 1e-3)
+    assert_close(written.radius((2, 2, 3)), simplex.radius((2, 2, 3)))
 
 
 @pytest.mark.parametrize("scale", [30.0, 3000.0])

@@ -23,52 +23,41 @@ def performative_prediction(sensitivity, mean=MEAN, deviation=DEVIATION, feasibl
     )
 
 
-def drifting(seed: int = 0, feasible_set=None, covariance=None) -> pc.PerformativeProblem:
-    """Three states, two inputs, two lags, a gain, noise with a mean; mildly performative."""
-    slope = 0.05 * normal(seed + 1, 6, 1, 2, 2, 3)
-    return pc.PerformativeProblem(
-        system=pc.LinearSystem(0.25 * normal(seed + 2, 3, 3), normal(seed + 3, 3, 2)),
-        horizon=6,
-        noise=pc.Gaussian([0.1, -0.2, 0.3], 0.2 * np.eye(3) if covariance is None else covariance),
-        cost=pc.QuadraticCost(np.eye(3), 0.5 * np.eye(2)),
-        memory=2,
-        gain=0.1 * normal(seed + 4, 2, 3),
-        perturbation=pc.DirectionalPerturbation(
-            0.5 * normal(seed + 5, 1, 3, 3), pc.Affine(jnp.full((6, 1), 0.4), slope)
-        ),
-        feasible_set=feasible_set,
-        initial_state=[1.0, 0.0, -1.0],
-    )
-
-
 def _switched_scale(M, params):
-    """Standard deviation between √low and √high, a steep function of one statistic of the policy."""
+    """Standard deviation between √low and √high, depending on one statistic of the policy."""
     statistic = jnp.sum(params["direction"] * M) - params["centre"]
     variance = params["low"] + (params["high"] - params["low"]) * (1 + jnp.tanh(params["slope"] * statistic)) / 2
     return jnp.sqrt(variance)[None]
 
 
-def _switched(direction, centre, slope, low=0.05, high=2.0) -> pc.PerformativeProblem:
+def _switched(seed, direction, centre, slope, low, high, mean=0.0, covariance=None, feasible_set=None):
+    """Three states, two inputs, two lags, a gain. All problems made here share what is compiled for them."""
     params = {"direction": direction, "centre": centre, "slope": slope, "low": low, "high": high}
     return pc.PerformativeProblem(
-        system=pc.LinearSystem(0.4 * normal(2, 3, 3), normal(3, 3, 2)),
+        system=pc.LinearSystem(0.4 * normal(seed + 2, 3, 3), 0.5 * normal(seed + 3, 3, 2)),
         horizon=6,
-        noise=pc.Gaussian(np.zeros(3), np.diag([1.0, 0.5, 2.0])),
+        noise=pc.Gaussian(jnp.broadcast_to(mean, 3), np.diag([1.0, 0.5, 2.0]) if covariance is None else covariance),
         cost=pc.QuadraticCost(np.eye(3), np.eye(2)),
         memory=2,
-        perturbation=pc.DirectionalPerturbation(normal(5, 1, 3, 3), pc.Function(_switched_scale, params)),
+        gain=0.05 * normal(seed + 4, 2, 3),
+        perturbation=pc.DirectionalPerturbation(normal(seed + 5, 1, 3, 3), pc.Function(_switched_scale, params)),
+        feasible_set=feasible_set,
         initial_state=[1.0, 0.0, -1.0],
     )
 
 
+def drifting(seed: int = 0, feasible_set=None, mean=0.1, covariance=None) -> pc.PerformativeProblem:
+    """Mildly performative: repeated minimisation contracts."""
+    return _switched(seed, normal(seed + 1, 2, 2, 3), 0.1, 0.5, 0.01, 0.1, mean, covariance, feasible_set)
+
+
 def strongly_performative(slope: float = 8.0) -> pc.PerformativeProblem:
-    """Three states, two lags, one stable policy, at which the derivative of Φ has an eigenvalue far below -1.
+    """One stable policy, at which the derivative of Φ has an eigenvalue far below -1.
 
     The world is calm where the policy is that of a turbulent one and turbulent where it is that of a calm one, so
     repeated minimisation jumps between the two; the statistic of Φ decreases in its own, so it crosses once.
     """
     nowhere = jnp.zeros((2, 2, 3))
-    calm = pc.best_response(_switched(nowhere, jnp.asarray(1.0), 50.0), nowhere)
-    turbulent = pc.best_response(_switched(nowhere, jnp.asarray(-1.0), 50.0), nowhere)
+    calm, turbulent = (pc.best_response(_switched(0, nowhere, side, 50.0, 0.05, 2.0), nowhere) for side in (1.0, -1.0))
     direction = (calm - turbulent) / jnp.sum((calm - turbulent) ** 2)  # 1 apart in the statistic
-    return _switched(direction, jnp.sum(direction * (calm + turbulent)) / 2, slope)
+    return _switched(0, direction, jnp.sum(direction * (calm + turbulent)) / 2, slope, 0.05, 2.0)

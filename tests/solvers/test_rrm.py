@@ -56,7 +56,7 @@ def test_rrm_ends_as_not_converged_when_it_drifts_without_a_fixed_point():
 
 
 def test_rrm_ends_as_not_converged_when_it_cycles():
-    solution = pc.solve(strongly_performative(), pc.RRM(max_steps=100), throw=False)
+    solution = pc.solve(strongly_performative(), pc.RRM(max_steps=40), throw=False)
     assert solution.result == pc.Result.not_converged
     assert float(jnp.linalg.norm(solution.M - solution.history[-2])) > 0.1 * float(jnp.linalg.norm(solution.M))
 

@@ -51,18 +51,18 @@ def by_hand(problem, steps, step_size, *, batch=1, deploy_every=1) -> list[np.nd
 )
 def test_rsgd_iterates_match_projected_sample_gradient_steps(feasible_set, batch):
     problem = drifting(0, feasible_set)
-    history = pc.solve(problem, pc.RSGD(4, pc.InverseStep(0.5, 5), batch=batch), key=KEY).history
-    assert_close(history, jnp.stack(by_hand(problem, 4, lambda n: 0.5 / (n + 5), batch=batch)), 1e-11, 1e-4)
+    history = pc.solve(problem, pc.RSGD(4, pc.InverseStep(0.05, 5), batch=batch), key=KEY).history
+    assert_close(history, jnp.stack(by_hand(problem, 4, lambda n: 0.05 / (n + 5), batch=batch)), 1e-11, 1e-4)
     for M in history:
         assert bool(feasible_set.contains(M, 1e-6))
 
 
 def test_rsgd_takes_gradients_in_the_world_of_the_last_deployed_iterate_when_lazy():
     problem = drifting(0)
-    solution = pc.solve(problem, pc.RSGD(7, 0.05, schedule=pc.Lazy(3)), key=KEY)
-    assert_close(solution.history, jnp.stack(by_hand(problem, 7, lambda n: 0.05, deploy_every=3)), 1e-11)
+    solution = pc.solve(problem, pc.RSGD(7, 0.002, schedule=pc.Lazy(3)), key=KEY)
+    assert_close(solution.history, jnp.stack(by_hand(problem, 7, lambda n: 0.002, deploy_every=3)), 1e-11)
     assert int(solution.stats["deployments"]) == 3  # at n = 0, 3, 6
-    assert int(pc.solve(problem, pc.RSGD(7, 0.05), key=KEY).stats["deployments"]) == 7
+    assert int(pc.solve(problem, pc.RSGD(7, 0.002), key=KEY).stats["deployments"]) == 7
 
 
 class Momentum(NamedTuple):
@@ -150,21 +150,21 @@ def stable():
 
 
 def test_rsgd_mean_field_converges_to_the_stable_point(stable):
-    solution = pc.solve(drifting(0), pc.RSGD(1200, 0.012, gradient=pc.Exact()), every=600)  # no key is needed
+    solution = pc.solve(drifting(0), pc.RSGD(1200, 0.006, gradient=pc.Exact()), every=600)  # no key is needed
     assert_close(solution.M, stable, 1e-6)
 
 
 def test_rsgd_error_falls_like_one_over_n_when_the_step_diminishes(stable):
     problem = drifting(0)
-    solver = pc.RSGD(3200, pc.InverseStep(1.0, 100))
+    solver = pc.RSGD(3200, pc.InverseStep(1.0, 200))
 
     def errors(key):
         return pc.solve(problem, solver, key=key, record=lambda M: jnp.sum((M - stable) ** 2), every=200).history
 
     mean = np.asarray(jax.jit(jax.vmap(errors))(jax.random.split(KEY, 48))).mean(axis=0)
-    assert mean[-1] < 0.02 * mean[0]
-    slope = np.polyfit(np.log(200 * np.arange(2, 17) + 100), np.log(mean[2:]), 1)[0]
-    assert -1.4 < slope < -0.6, f"error falls like n^{slope:.2f}"
+    assert mean[-1] < 0.1 * mean[0]
+    slope = np.polyfit(np.log(200 * np.arange(2, 17) + 200), np.log(mean[2:]), 1)[0]
+    assert -1.6 < slope < -0.7, f"error falls like n^{slope:.2f}"
 
 
 # --- failures --------------------------------------------------------------------------------------------------------
@@ -198,7 +198,7 @@ def test_rsgd_keeps_the_last_finite_iterate_when_a_step_is_not_finite():
     assert solution.result == pc.Result.nonfinite and int(solution.steps) == 6
     assert_close(solution.M, until_then.M, 1e-12, 1e-5)
     assert bool(jnp.all(jnp.isfinite(solution.history)))
-    with pytest.raises(pc.SolveError, match="not finite.*step 6"):
+    with pytest.raises(pc.SolveError, match=r"not finite.*step 6"):
         pc.solve(problem, pc.RSGD(20, burst), key=KEY)
 
 

@@ -12,10 +12,14 @@ from tests.oracles.performative_prediction import stable_decision
 from tests.solvers.problems import MEAN, drifting, performative_prediction, strongly_performative
 from tests.tools import assert_close, central_differences, normal
 
+SOLVER = pc.StablePoint(max_steps=30)  # one for all tests, so that problems of equal shape share what is compiled
+
 
 class TestStablePoint(SolverContract):
+    test_history_keeps_the_record_of_every_other_step = None  # the loop's work: tested with cheaper solvers
+
     def solver(self):
-        return pc.StablePoint(max_steps=30)
+        return SOLVER
 
     @pytest.mark.float32
     def test_stable_point_is_where_repeated_minimisation_goes(self):
@@ -40,7 +44,7 @@ def test_stable_point_matches_the_published_one_whatever_the_sensitivity(sensiti
     problem = performative_prediction(sensitivity)
     stable = np.full((1, 1, 1), stable_decision(MEAN, sensitivity))
     for start in (None, [[[-350.0]]], [[[1e4]]]):
-        solution = pc.solve(problem, pc.StablePoint(), start)
+        solution = pc.solve(problem, SOLVER, start)
         assert_close(solution.M, stable, 1e-12 if start is None else 1e-9, 1e-3)
         assert bool(solution.stats["unique"])
 
@@ -55,17 +59,17 @@ def test_best_response_derivative_is_the_published_sensitivity_when_the_covarian
 def test_stable_point_is_not_claimed_when_none_exists(mean, start):
     for sensitivity in (1.0, 1.0 + 2.3e-16, 1.0 - 1.2e-16):  # at the last two there is one, at 1e16
         problem = performative_prediction(sensitivity, mean=mean)
-        solution = pc.solve(problem, pc.StablePoint(), start, throw=False)
+        solution = pc.solve(problem, SOLVER, start, throw=False)
         assert solution.result == pc.Result.not_converged
         assert bool(jnp.all(jnp.isfinite(solution.M))) and float(jnp.max(jnp.abs(solution.M))) < 1e13
         with pytest.raises(pc.SolveError, match="no fixed point"):
-            pc.solve(problem, pc.StablePoint(), start)
+            pc.solve(problem, SOLVER, start)
 
 
 @pytest.mark.parametrize("slope", [8.0, 20.0])
 def test_stable_point_solves_the_fixed_point_equation_when_repeated_minimisation_cycles(slope):
     problem = strongly_performative(slope)
-    solution = pc.solve(problem, pc.StablePoint())
+    solution = pc.solve(problem, SOLVER)
     M = solution.M
     assert float(pc.residual(problem, M)) <= 1e-11
     assert_close(pc.best_response(problem, M), M, 1e-10)
@@ -86,16 +90,16 @@ def test_stable_point_solves_the_fixed_point_equation_when_repeated_minimisation
 
 def test_stable_point_is_the_same_from_every_start_when_there_is_one():
     problem = strongly_performative()
-    reference = pc.solve(problem, pc.StablePoint()).M
+    reference = pc.solve(problem, SOLVER).M
     for seed in range(4):
-        assert_close(pc.solve(problem, pc.StablePoint(), normal(seed, 2, 2, 3)).M, reference, 1e-8)
+        assert_close(pc.solve(problem, SOLVER, normal(seed, 2, 2, 3)).M, reference, 1e-8)
 
 
 def test_stable_point_is_one_of_the_fixed_points_when_a_bounded_set_has_several():
     problem = performative_prediction(1.5, feasible_set=pc.FrobeniusBall(30.0))
     found = set()
     for start in (-30.0, -26.0, -20.5, 0.0, 29.0):
-        solution = pc.solve(problem, pc.StablePoint(), [[[start]]])
+        solution = pc.solve(problem, SOLVER, [[[start]]])
         assert float(pc.residual(problem, solution.M)) <= 1e-11
         found.add(round(float(solution.M[0, 0, 0]), 8))
     assert found <= {-30.0, -20.0, 30.0} and len(found) >= 2
@@ -156,7 +160,7 @@ def test_stable_policy_is_the_least_norm_best_in_hindsight_when_the_disturbance_
     values = np.asarray(normal(4, HORIZON, 3)).copy()
     values[:, silent] = 0
     problem = recorded(values, None if row_total is None else pc.RowSum(row_total))
-    solution = pc.solve(problem, pc.StablePoint(max_steps=8))
+    solution = pc.solve(problem, SOLVER)
     expected, unique = in_hindsight(values, row_total)
     assert unique == alone[row_total is not None]
     assert bool(solution.stats["unique"]) == unique
@@ -170,23 +174,13 @@ FACTOR = np.array([[1.0, 0.0], [0.5, 1.0], [-1.0, 0.3]])  # its range is a plane
 
 
 def singular(feasible_set=None, covariance=None) -> pc.PerformativeProblem:
-    problem = drifting(0, feasible_set)
-    return pc.PerformativeProblem(
-        system=problem.system,
-        horizon=problem.horizon,
-        noise=pc.Gaussian(np.zeros(3), FACTOR @ FACTOR.T if covariance is None else covariance),
-        cost=problem.cost,
-        memory=2,
-        gain=problem.gain,
-        perturbation=problem.perturbation,
-        feasible_set=feasible_set,
-    )
+    return drifting(0, feasible_set, 0.0, FACTOR @ FACTOR.T if covariance is None else covariance)
 
 
 @pytest.mark.parametrize("row_total", [None, 0.6], ids=["unconstrained", "row sums"])
 def test_stable_policy_is_the_least_norm_best_response_when_the_covariance_is_singular(row_total):
     problem = singular(None if row_total is None else pc.RowSum(row_total))
-    solution = pc.solve(problem, pc.StablePoint(max_steps=30))
+    solution = pc.solve(problem, SOLVER)
     # Without constraint the best response does not depend on a definite covariance; a singular one lets us see only
     # its part in the plane, in which the row sums (the plane does not contain the ones) cost nothing.
     definite = pc.best_response(singular(covariance=np.eye(3)), solution.M)
@@ -204,7 +198,7 @@ def test_stable_policy_is_the_least_norm_best_response_when_the_covariance_is_si
 
 def test_stable_policy_is_not_called_unique_on_row_sums_when_the_covariance_has_rank_one():
     ray = np.outer(FACTOR[:, 0], FACTOR[:, 0])
-    solution = pc.solve(singular(pc.RowSum(0.6), ray), pc.StablePoint(max_steps=30))
+    solution = pc.solve(singular(pc.RowSum(0.6), ray), SOLVER)
     assert not bool(solution.stats["unique"]) and float(solution.stats["residual"]) <= 1e-11
     # least norm: no part across both the ray and the ones
     across = scipy.linalg.null_space(np.stack([FACTOR[:, 0], np.ones(3)]))

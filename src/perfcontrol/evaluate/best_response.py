@@ -220,8 +220,11 @@ class _Affine:
         tolerance = 20 * float(jnp.finfo(form.linear.dtype).eps)
 
         def solve(gradient: Array) -> Array:
-            right = -tangent(gradient)
-            return jax.scipy.sparse.linalg.cg(hessian, right, tol=tolerance, maxiter=10 * right.size)[0]
+            right = -tangent(tangent(gradient))
+            # What rounding leaves of a gradient need not be in the range of the Hessian: never chase it.
+            rounding = tolerance * (_norm(gradient) + _norm(form.linear))
+            found = jax.scipy.sparse.linalg.cg(hessian, right, tol=tolerance, atol=rounding, maxiter=10 * right.size)[0]
+            return tangent(found)
 
         return solve
 

@@ -36,10 +36,10 @@ class Trajectories(eqx.Module):
     cost: (samples,) summed over the T+1 stages. draws: the perturbations, every leaf with a leading sample axis.
     """
 
-    x: Float[Array, "S T1 n"]
-    u: Float[Array, "S T1 m"]
-    w: Float[Array, "S T n"]
-    cost: Float[Array, " S"]
+    x: Float[Array, "*S T1 n"]
+    u: Float[Array, "*S T1 m"]
+    w: Float[Array, "*S T n"]
+    cost: Float[Array, "*S"]
     draws: Draws
 
 
@@ -102,11 +102,11 @@ def run_path(problem: PerformativeProblem, policy: Array, x0: Array, w: Array, d
 def _simulate(problem: PerformativeProblem, M: Array, deployed: Array, key: Array, samples: int) -> Trajectories:
     policy, reacting = problem.structure.lift(M), problem.structure.lift(deployed)
 
-    def one(index: Array) -> Trajectories:
+    def one(index: Array) -> tuple[Array, Array, Array, Array, Draws]:
         path = sample_path(problem, policy, reacting, jax.random.fold_in(key, index))
-        return Trajectories(path.x, path.u, path.w, jnp.sum(problem.cost.path_cost(path.x, path.u)), path.draws)
+        return path.x, path.u, path.w, jnp.sum(problem.cost.path_cost(path.x, path.u)), path.draws
 
-    return jax.lax.map(one, jnp.arange(samples), batch_size=min(BATCH, samples))
+    return Trajectories(*jax.lax.map(one, jnp.arange(samples), batch_size=min(BATCH, samples)))
 
 
 @eqx.filter_jit

@@ -20,6 +20,11 @@ def stack_problems(problems: list[PerformativeProblem]) -> PerformativeProblem:
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *problems)
 
 
+def in_single_precision(problem: PerformativeProblem) -> PerformativeProblem:
+    """The problem with every floating-point array in float32."""
+    return jax.tree.map(lambda leaf: leaf.astype(jnp.float32) if eqx.is_inexact_array(leaf) else leaf, problem)
+
+
 def pick(problems: PerformativeProblem, index: Array) -> PerformativeProblem:
     """One problem of a stack."""
     return jax.tree.map(lambda leaf: leaf[index] if eqx.is_array(leaf) else leaf, problems)

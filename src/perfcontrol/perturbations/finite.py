@@ -89,7 +89,7 @@ class FinitePerturbation(AbstractPerturbation):
         if isinstance(constant, AbstractPolicyMap) or not is_concrete(constant):
             return
         if constant.ndim == 0 or not bool(jnp.all(_is_distribution(constant))):
-            got = f"least entry {float(jnp.min(constant)):.3g} and sums {jnp.sum(constant, axis=-1)}"
+            got = f"least entry {float(jnp.min(constant)):.3g} and sums {jnp.sum(jnp.atleast_1d(constant), axis=-1)}"
             required = "be nonnegative with sum one over the values"
             raise fail("probabilities", got, required, "Divide them by their sum.")
 

@@ -52,7 +52,8 @@ class SampledPerturbation(AbstractPerturbation):
 
     def resize(self, policy_shape: tuple[int, int, int], horizon: int) -> "SampledPerturbation":
         """This law knowing how many columns its draws have."""
-        width = (*self._shape(policy_shape), policy_shape[-1])[2]
+        shape = self._shape(policy_shape)
+        width = shape[-1] if shape else None
         return SampledPerturbation(self.sampler, self.declared_bound, self.declared_sensitivity, width)
 
     def columns(self, state_size: int, input_size: int) -> int:

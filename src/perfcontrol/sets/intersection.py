@@ -11,7 +11,6 @@ system, solved once at the end, is the derivative of the projection.
 """
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -176,7 +175,7 @@ def _project(sets: Sets, M: Array) -> Array:
 
 @_project.def_jvp
 def _project_derivative(primals: tuple[Sets, Array], tangents: tuple[Any, Array | None]) -> tuple[Array, Array]:
-    sets, M = primals
+    sets, M = jax.tree.map(jnp.asarray, primals)
     moved_sets, dM = tangents
     shape = M.shape
     split = _solve(sets, M)
@@ -225,7 +224,7 @@ class Intersection(AbstractSet):
 
     sets: Sets
 
-    def __init__(self, sets: Sequence[AbstractSet]):
+    def __init__(self, sets: Any):
         if isinstance(sets, AbstractSet) or not all(isinstance(member, AbstractSet) for member in sets):
             raise fail("sets", repr(type(sets).__name__), "be a sequence of feasible sets", "Pass a list of sets.")
         flat = [part for member in sets for part in (member.sets if isinstance(member, Intersection) else (member,))]
@@ -276,7 +275,7 @@ class Intersection(AbstractSet):
         if len(self.sets) == 1:
             return self.sets[0].support(direction)
         flat = direction.reshape(-1, *shape)
-        best = jax.vmap(lambda d: _support(self.sets, d, reach.astype(d.dtype)))(flat).reshape(direction.shape[:-3])
+        best = jax.lax.map(lambda d: _support(self.sets, d, reach.astype(d.dtype)), flat).reshape(direction.shape[:-3])
         known = [value for member in self.sets if (value := member.support(direction)) is not None]
         return jnp.min(jnp.stack([best, *known]), axis=0)
 

@@ -86,7 +86,10 @@ class Certificate:
                 )
             return f"{title} finds no local convergence of repeated minimisation: spectral radius {numbers}."
         if self.holds:
-            return f"{title} holds ({numbers}): repeated minimisation contracts by at least {self.rate:.4g} a round."
+            return (
+                f"{title} holds ({numbers}): each round of repeated minimisation multiplies the distance to the stable "
+                f"policy by at most {self.rate:.4g}."
+            )
         return f"{title} does not hold ({numbers}); it is sufficient, not necessary, so nothing follows from that."
 
     def _existence(self) -> str:

@@ -17,7 +17,7 @@ from perfcontrol.costs import QuadraticCost
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.theory.existence import constant_mean
 from perfcontrol.theory.ingredients import Ingredients
-from perfcontrol.theory.local import hessian, tangent_basis, without_reaction
+from perfcontrol.theory.local import fixed_noise, hessian, tangent_basis, without_reaction
 
 
 def printed_convexity(items: Ingredients, kappa: float, gamma: float) -> float:
@@ -29,12 +29,12 @@ def printed_convexity(items: Ingredients, kappa: float, gamma: float) -> float:
 def rigorous_convexity(problem: PerformativeProblem, items: Ingredients) -> tuple[float, str]:
     """The best proved lower bound of the Hessian on the feasible set, and which one it is."""
     bounds = {"feedforward": _feedforward(problem, items)}
-    if problem.perturbation.mean(problem.structure.lift(problem.initial_policy()), problem.horizon) is not None:
-        if constant_mean(problem):
-            if np.all(np.isfinite(items.strong_convexity)):
-                bounds["jensen"] = _jensen(problem, items.strong_convexity / 2)
-            if isinstance(problem.cost, QuadraticCost):
-                bounds["quadratic jensen"] = _jensen(problem, None)
+    mean = problem.perturbation.mean(problem.structure.lift(problem.initial_policy()), problem.horizon)
+    if mean is not None and constant_mean(problem):
+        if np.all(np.isfinite(items.strong_convexity)):
+            bounds["jensen"] = _jensen(problem, items.strong_convexity / 2)
+        if isinstance(problem.cost, QuadraticCost):
+            bounds["quadratic jensen"] = _jensen(problem, None)
     name = max(bounds, key=lambda key: bounds[key])
     return bounds[name], name
 
@@ -58,7 +58,7 @@ def _feedforward(problem: PerformativeProblem, items: Ingredients) -> float:
     n, m, T, H = problem.state_size, problem.input_size, problem.horizon, problem.memory
     gains = np.asarray(problem.gains(), dtype=float)
     norms = np.linalg.norm(gains, ord=2, axis=(-2, -1))
-    covariances = np.asarray(along_time(problem.noise.covariance, 2, T), dtype=float)
+    covariances = np.asarray(along_time(fixed_noise(problem).covariance, 2, T), dtype=float)
     floors = np.maximum(np.linalg.eigvalsh(covariances)[:, 0], 0)
     stage = [np.eye(m) * mu / (1 + k**2) for mu, k in zip(items.strong_convexity, norms, strict=True)]
     if isinstance(problem.cost, QuadraticCost):

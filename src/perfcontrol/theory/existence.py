@@ -26,6 +26,8 @@ def set_radius(problem: PerformativeProblem) -> float | None:
 
 def reaction_is_continuous(problem: PerformativeProblem) -> bool:
     """Whether M ↦ D_t(M) is known to be continuous: a finite sensitivity, or a smooth family of this package."""
+    if problem.noise_reacts:
+        return False
     return problem.sensitivity() is not None or isinstance(problem.perturbation, DirectionalPerturbation)
 
 
@@ -46,7 +48,7 @@ def existence(problem: PerformativeProblem) -> tuple[bool | None, str]:
 def bounded_response(problem: PerformativeProblem) -> bool:
     """Whether the least-squares argument applies."""
     law = problem.perturbation
-    if not isinstance(problem.cost, QuadraticCost) or not problem.feasible_set.affine:
+    if not isinstance(problem.cost, QuadraticCost) or not problem.feasible_set.affine or problem.noise_reacts:
         return False
     if isinstance(law, DirectionalPerturbation):
         if isinstance(law.mean_map, AbstractPolicyMap) and not constant_mean(problem):

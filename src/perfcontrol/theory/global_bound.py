@@ -32,7 +32,7 @@ from perfcontrol.problem import PerformativeProblem
 from perfcontrol.random_vectors import Constant
 from perfcontrol.theory.certificate import Assumption, Certificate, not_applicable
 from perfcontrol.theory.existence import constant_mean, existence
-from perfcontrol.theory.local import DENSE_LIMIT, tangent_basis
+from perfcontrol.theory.local import DENSE_LIMIT, fixed_noise, tangent_basis
 
 
 class _VarianceOperator(CovarianceOperator):
@@ -147,14 +147,12 @@ def _form_derivative(problem: PerformativeProblem, basis: Array, variances: Arra
 
 def _simplified(problem: PerformativeProblem) -> PerformativeProblem:
     """Without what does not enter the gradient for zero-mean noise: the initial state and the targets."""
-    if float(jnp.max(jnp.abs(problem.noise.mean))) > 0:
+    if float(jnp.max(jnp.abs(fixed_noise(problem).mean))) > 0:
         return problem
     cost = problem.cost
     assert isinstance(cost, QuadraticCost)
     zero = Constant(jnp.zeros(problem.state_size, problem.dtype))
-    return eqx.tree_at(
-        lambda p: (p.initial_state, p.cost), problem, (zero, QuadraticCost(cost.Q, cost.R, cost.cross))
-    )
+    return eqx.tree_at(lambda p: (p.initial_state, p.cost), problem, (zero, QuadraticCost(cost.Q, cost.R, cost.cross)))
 
 
 def largest_on_sublevel(L: np.ndarray, G: np.ndarray, level: float) -> float:
@@ -202,6 +200,8 @@ def certify_global(problem: PerformativeProblem, *, scale_range: Any = None) -> 
         missing.append("the perturbations are not of fixed directions (pc.DirectionalPerturbation)")
     elif not constant_mean(problem):
         missing.append("the mean of the perturbations depends on the policy")
+    if problem.noise_reacts:
+        missing.append("the noise reacts to the policy")
     if int(np.prod(problem.policy_shape)) > DENSE_LIMIT:
         missing.append(f"more than {DENSE_LIMIT} free parameters")
     ranges = None

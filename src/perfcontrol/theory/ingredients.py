@@ -12,6 +12,7 @@ from perfcontrol._linalg import along_time
 from perfcontrol.costs import QuadraticCost
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.theory.certificate import Assumption, Status
+from perfcontrol.theory.local import fixed_noise
 from perfcontrol.theory.strong_stability import check_per_step
 
 DECLARABLE = (
@@ -115,7 +116,8 @@ def gather(
         if name not in DECLARABLE:
             raise fail("declared", repr(name), f"name one of {DECLARABLE}", "Check the spelling.")
     T = problem.horizon
-    missing: list[str] = []
+    noise = fixed_noise(problem)
+    missing: list[str] = ["the noise reacts to the policy"] if problem.noise_reacts else []
     assumptions: list[Assumption] = []
 
     def number(name: str, own: Any, what: str, source: str) -> float:
@@ -143,7 +145,7 @@ def gather(
 
     radius = problem.feasible_set.radius(problem.policy_shape)
     lifted = None if radius is None else problem.structure.norm * float(radius)
-    covariances = np.asarray(problem.noise.covariance, dtype=float)
+    covariances = np.asarray(noise.covariance, dtype=float)
     covariances = covariances if covariances.ndim == 3 else covariances[None]
     values, vectors = np.linalg.eigh(covariances)
     quietest = int(np.argmin(values[:, 0]))
@@ -157,7 +159,7 @@ def gather(
         initial_bound=number(
             "initial_bound", problem.initial_state.bound, "the bound of the initial state", "its law is unbounded"
         ),
-        noise_bound=number("noise_bound", problem.noise.bound, "the bound W of the noise", "its law is unbounded"),
+        noise_bound=number("noise_bound", noise.bound, "the bound W of the noise", "its law is unbounded"),
         policy_bound=number(
             "policy_bound", lifted, "the largest norm of a feasible policy", "the feasible set is unbounded"
         ),
@@ -181,7 +183,7 @@ def gather(
         gradient_offset=constants[3],
         noise_floor=floor,
         quiet_direction=vectors[quietest, :, 0],
-        noise_mean=float(np.max(np.linalg.norm(np.asarray(along_time(problem.noise.mean, 1, T)), axis=-1))),
+        noise_mean=float(np.max(np.linalg.norm(np.asarray(along_time(noise.mean, 1, T)), axis=-1))),
         structure_norm=problem.structure.norm,
         missing=tuple(missing),
         assumptions=tuple(assumptions),

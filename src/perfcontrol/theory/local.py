@@ -18,6 +18,7 @@ from perfcontrol._linalg import along_time
 from perfcontrol.evaluate.exact import exact_gradient
 from perfcontrol.perturbations import NoPerturbation
 from perfcontrol.problem import PerformativeProblem
+from perfcontrol.random_vectors import AbstractRandomVector
 from perfcontrol.systems import LinearSystem
 
 DENSE_LIMIT = 1500  # free parameters up to which p × p matrices are built
@@ -50,6 +51,11 @@ def hessian(problem: PerformativeProblem, deployed: Array) -> np.ndarray:
 def reaction_jacobian(problem: PerformativeProblem, M: Array, deployed: Array) -> np.ndarray:
     """𝐄 = ∂_2 g at (M, deployed), (p, p): how the gradient moves with the deployed policy."""
     return np.asarray(_columns(problem, M, deployed, "deployed"), dtype=float).T
+
+
+def fixed_noise(problem: PerformativeProblem) -> AbstractRandomVector:
+    """The law of w_t; where it reacts, the one under the initial policy."""
+    return problem.noise_under(problem.structure.lift(problem.initial_policy()))
 
 
 def without_reaction(problem: PerformativeProblem) -> PerformativeProblem:

@@ -11,6 +11,7 @@ from perfcontrol.theory.constants import Constants, printed_constants, repaired_
 from perfcontrol.theory.convexity import printed_convexity
 from perfcontrol.theory.existence import constant_mean, existence
 from perfcontrol.theory.ingredients import Ingredients, gather
+from perfcontrol.theory.local import fixed_noise
 from perfcontrol.theory.strong_stability import StrongStability, candidates
 
 SHRINKING = (1.0, 0.9, 0.75, 0.5, 0.25, 0.1)  # a smaller γ is valid too, and 1/(1-γ) may like it
@@ -21,7 +22,7 @@ def assumptions_missing(problem: PerformativeProblem, items: Ingredients) -> lis
     missing = list(items.missing)
     if items.noise_mean > 1e-9 * max(1.0, items.noise_bound):
         missing.append("the noise has a mean (assumption A1)")
-    if problem.noise.covariance.ndim == 3:
+    if fixed_noise(problem).covariance.ndim == 3:
         missing.append("the noise is not identically distributed (assumption A1)")
     if problem.perturbation.columns(problem.state_size, problem.input_size) > problem.state_size:
         missing.append("the perturbations act on the input (assumption A2)")

@@ -64,11 +64,13 @@ def local_model(problem: PerformativeProblem, M: Array) -> LocalModel:
     # Φ(M') = Proj(Φ - η g(Φ; M')), differentiated in the tangent space; without curvature this is -H⁻¹E.
     system = eye - slope + small * slope @ H
     response = np.linalg.lstsq(system, -small * slope @ E, rcond=1e-13)[0] if basis.size else np.zeros((0, 0))
-    damping = None
+    damping: Callable[[float], np.ndarray] | None = None
     if basis.size and np.abs(slope - eye).max() > 1e-6:
 
-        def damping(step: float) -> np.ndarray:
+        def curved(step: float) -> np.ndarray:
             return basis.T @ projection_derivative(problem, M - step * gradient) @ basis
+
+        damping = curved
 
     return LocalModel(M, response, H + E, basis, damping)
 

@@ -1,0 +1,191 @@
+"""Rates and step sizes: what contraction and strong monotonicity promise of RRM and RSGD.
+
+With m = μ̃ - S > 0 (S the aggregated sensitivity), L = Σ λ_t + S, V ≥ Var ∇J_T and b paths a step, comparing with
+M^PS = Proj(M^PS - η g^PS) (no interior point is needed) gives
+
+    E_{n+1} ≤ (1 - 2 η_n m + η_n² L²) E_n + η_n² V/b,      E_n = E ‖M_n - M^PS‖²_F,
+
+and for η_0 ≤ min(m/L², 1/m), η_n/η_{n+1} ≤ 1 + m η_{n+1}/2:  E_N ≤ Π_{n<N}(1 - η_n m) E_0 + 2 η_{N-1} V/(b m).
+"""
+
+import math
+from typing import Any, Literal, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from perfcontrol._checks import check_integer, fail
+from perfcontrol.problem import PerformativeProblem
+from perfcontrol.solvers import InverseStep
+from perfcontrol.solvers.step_sizes import as_step_size
+from perfcontrol.theory.certificate import Certificate
+from perfcontrol.theory.certify import certify
+from perfcontrol.theory.local import check_problem
+
+
+class TheoremStepSize(NamedTuple):
+    """η_n = phi1 / (n + phi2); pass it on as `pc.InverseStep(*step)`."""
+
+    phi1: float
+    phi2: float
+
+
+class DescentConstants(NamedTuple):
+    """m = μ̃ - S, L = Σλ + S, V, and the certificate that they come from."""
+
+    monotonicity: float
+    lipschitz: float
+    variance: float
+    certificate: Certificate
+
+
+def descent_constants(problem: PerformativeProblem, kind: str = "rigorous", **declared: Any) -> DescentConstants:
+    """m, L and V of a problem.
+
+    Raises:
+        InputError: the certificate is not applicable, or S ≥ μ̃, so that no step size is proved to work.
+    """
+    check_problem(problem)
+    if kind not in ("rigorous", "paper"):
+        raise fail("kind", repr(kind), "be 'rigorous' or 'paper'", "Only these two come with gradient bounds.")
+    certificate = certify(problem, kind, **declared)
+    if not certificate.applicable:
+        raise fail(
+            "problem",
+            f"a certificate that is not applicable: {'; '.join(certificate.missing)}",
+            f"admit the {kind} certificate",
+            "Declare what is missing, or use pc.safe_step.",
+        )
+    assert certificate.lhs is not None and certificate.rhs is not None
+    if not certificate.holds:
+        raise fail(
+            "problem",
+            f"S = {certificate.lhs:.4g} ≥ μ̃ = {certificate.rhs:.4g}",
+            "have an aggregated sensitivity S below the strong convexity μ̃",
+            "No step size is proved to work then; pc.safe_step finds one by local analysis.",
+        )
+    constants = certificate.values["constants"]
+    return DescentConstants(
+        certificate.rhs - certificate.lhs, constants.total_smoothness + certificate.lhs, constants.variance, certificate
+    )
+
+
+def theorem_step_size(problem: PerformativeProblem, *, kind: str = "rigorous", **declared: Any) -> TheoremStepSize:
+    """φ₁ and φ₂ of the diminishing step η_n = φ₁/(n + φ₂) with the largest first step that the theorem allows.
+
+    φ₁/φ₂ = c with c = min(m/L², 1/m) (as printed: m/(2L²) in place of m/L²), and φ₂ ≥ 1 the smallest for which
+    φ₁/(1 + 1/φ₂) ≥ 2/m.
+
+    Args:
+        kind: "rigorous", or "paper" for the printed constants. declared: values for the certificate.
+
+    Raises:
+        InputError: no such step exists, with the reason.
+
+    References:
+        Theorem 1, conditions (17) and (18).
+    """
+    m, L, _, _ = descent_constants(problem, kind, **declared)
+    first = min(m / L**2 / (2 if kind == "paper" else 1), 1 / m)
+    ratio = 2 / (m * first)
+    phi2 = max(1.0, (ratio + math.sqrt(ratio**2 + 4 * ratio)) / 2)
+    return TheoremStepSize(first * phi2, phi2)
+
+
+def rrm_error_bound(
+    problem: PerformativeProblem, initial_error: float, steps: int, *, kind: str = "rigorous", **options: Any
+) -> np.ndarray:
+    """‖M_n - M^PS‖_F ≤ rateⁿ ‖M_0 - M^PS‖_F for n = 0..steps, (steps+1,).
+
+    For `kind="global"` the contraction is in the norm N; the bound then carries √cond of it once.
+
+    Args:
+        initial_error: ‖M_0 - M^PS‖_F, or a bound of it such as the diameter of the set. steps: N.
+
+    Raises:
+        InputError: the certificate is not applicable or does not hold.
+
+    References:
+        Lemma on existence and uniqueness.
+    """
+    steps = check_integer("steps", steps, 0)
+    initial_error = _error("initial_error", initial_error)
+    if kind not in ("rigorous", "paper", "global"):
+        raise fail("kind", repr(kind), "be 'rigorous', 'paper' or 'global'", "The sharp test is local: no bound.")
+    certificate = certify(check_problem(problem), kind, **options)
+    if not certificate.holds:
+        raise fail("problem", str(certificate), f"satisfy the {kind} certificate", "No contraction is proved.")
+    assert certificate.rate is not None
+    factor = 1.0
+    if kind == "global" and "metric" in certificate.values:
+        values = np.linalg.eigvalsh(certificate.values["metric"])
+        factor = math.sqrt(values[-1] / values[0])
+    curve = factor * initial_error * certificate.rate ** np.arange(steps + 1.0)
+    curve[0] = initial_error
+    return curve
+
+
+def rsgd_error_bound(
+    problem: PerformativeProblem,
+    step_size: Any,
+    initial_error: float,
+    steps: int,
+    *,
+    batch: int = 1,
+    kind: str = "rigorous",
+    form: Literal["recursion", "closed", "printed"] = "recursion",
+    **declared: Any,
+) -> np.ndarray:
+    """A bound of E ‖M_n - M^PS‖²_F along RSGD for n = 0..steps, (steps+1,).
+
+    Args:
+        step_size: as `pc.RSGD` takes it. initial_error: E ‖M_0 - M^PS‖²_F. batch: paths a step.
+        kind: whose constants: "rigorous" or "paper". form: "recursion" (any step sizes; the sharpest), "closed" (the
+        product and 2η_{N-1}V/m; step sizes as in the general-step lemma) or "printed" (Theorem 1 as printed, with
+        e^{-Σ_{n=1}^N φ₁m/n} in place of the product, which can be too small, and 4 in place of 2).
+
+    Raises:
+        InputError: no step is proved to work, or the step sizes break the conditions of the form asked for.
+
+    References:
+        Theorem 1; the lemma for general step sizes (Appendix G).
+    """
+    steps, batch = check_integer("steps", steps, 0), check_integer("batch", batch, 1)
+    initial_error = _error("initial_error", initial_error)
+    m, L, V, _ = descent_constants(problem, kind, **declared)
+    rule = as_step_size(step_size)
+    eta = np.array([float(rule(jnp.asarray(n))) for n in range(steps)])
+    curve = np.empty(steps + 1)
+    curve[0] = initial_error
+    if form == "recursion":
+        for n in range(steps):
+            curve[n + 1] = (1 - 2 * eta[n] * m + (eta[n] * L) ** 2) * curve[n] + eta[n] ** 2 * V / batch
+        return curve
+    if form == "printed":
+        if not isinstance(rule, InverseStep):
+            raise fail("step_size", type(rule).__name__, "be an InverseStep for Theorem 1", "Or pass form='closed'.")
+        phi1 = float(rule.phi1)
+        n = np.arange(1, steps + 1)
+        curve[1:] = np.exp(-m * phi1 * np.cumsum(1 / n)) * initial_error + 4 * phi1 * V / (m * batch * n)
+        return curve
+    if form != "closed":
+        raise fail("form", repr(form), "be 'recursion', 'closed' or 'printed'", "Pass one of these names.")
+    limit = min(m / L**2, 1 / m)
+    slow = np.all(eta[:-1] <= eta[1:] * (1 + m * eta[1:] / 2) * (1 + 1e-12)) if steps > 1 else True
+    if steps and (eta.max() > limit * (1 + 1e-12) or not slow):
+        raise fail(
+            "step_size",
+            f"a first step {eta.max():.3g}",
+            f"start at most at min(m/L², 1/m) = {limit:.3g} and shrink by at most 1 + mη/2 a step",
+            "Use pc.theorem_step_size, or form='recursion'.",
+        )
+    product = np.cumprod(1 - eta * m)
+    curve[1:] = product * initial_error + 2 * eta * V / (m * batch)
+    return curve
+
+
+def _error(name: str, value: Any) -> float:
+    value = float(value)
+    if not (value >= 0 and math.isfinite(value)):
+        raise fail(name, str(value), "be a non-negative number", "It is a distance to the stable policy.")
+    return value

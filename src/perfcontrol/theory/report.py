@@ -1,0 +1,66 @@
+"""Certificates as plain data, for tables, JSON and the command line."""
+
+from typing import Any
+
+import numpy as np
+
+from perfcontrol.problem import PerformativeProblem
+from perfcontrol.theory.certificate import KINDS, Certificate
+from perfcontrol.theory.certify import certify
+
+PLAIN_VALUES = (
+    "kappa",
+    "gamma",
+    "convexity",
+    "mean_field_stable",
+    "mean_step",
+    "mean_square_step",
+    "mean_square_step_error",
+    "error_floor",
+    "contraction_estimate",
+)
+
+
+def plain(value: Any) -> Any:
+    """`value` as numbers, strings, lists and None that JSON can hold; infinities and NaN become strings."""
+    if isinstance(value, np.ndarray):
+        return [plain(item) for item in value.tolist()]
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    if isinstance(value, int | float | np.number):
+        number = float(value)
+        return number if np.isfinite(number) else str(number)
+    return value
+
+
+def certificate_row(certificate: Certificate) -> dict[str, Any]:
+    """One certificate as plain data."""
+    row: dict[str, Any] = {
+        name: plain(getattr(certificate, name))
+        for name in ("kind", "applicable", "holds", "exists", "existence", "lhs", "rhs", "margin", "rate")
+    }
+    row["missing"] = list(certificate.missing)
+    row["weights"] = plain(certificate.weights)
+    row["contributions"] = plain(certificate.contributions)
+    row["assumptions"] = [{"text": item.text, "status": item.status} for item in certificate.assumptions]
+    row["values"] = {name: plain(certificate.values[name]) for name in PLAIN_VALUES if name in certificate.values}
+    row["text"] = str(certificate)
+    return row
+
+
+def verdict_rows(
+    problem: PerformativeProblem, kinds: tuple[str, ...] = KINDS, *, batch: int = 1, key: Any = None
+) -> list[dict[str, Any]]:
+    """Every certificate of a problem as plain data, one dict a kind.
+
+    Args:
+        kinds: which ones. batch, key: of the sharp one.
+
+    Returns:
+        Dicts with "kind", "applicable", "missing", "holds", "exists", "existence", "lhs", "rhs", "margin", "rate",
+        "weights", "contributions", "assumptions", "values" and "text".
+    """
+    options: dict[str, dict[str, Any]] = {"sharp": {"batch": batch, "key": key}}
+    return [certificate_row(certify(problem, kind, **options.get(kind, {}))) for kind in kinds]

@@ -1,0 +1,126 @@
+"""The reproduction end to end, small: files, claims, resuming, and the rules that turn data into verdicts."""
+
+import json
+import shutil
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+import xarray
+
+import perfcontrol as pc
+from perfcontrol.config import REGIMES, ReproduceSettings
+from perfcontrol.experiments import reproduce as module
+from perfcontrol.experiments.reproduce import Outcome, reproduce
+from perfcontrol.report import paper_claims
+
+SETTINGS = ReproduceSettings(seeds=3, steps=100, cure_steps=200, sweep_seeds=2, sweep_steps=100)
+STAGES = ("exact", "exact_simplex", "runs", "cure", "sweep")
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Outcome]:
+    out = tmp_path_factory.mktemp("paper")
+    return out, reproduce(out, SETTINGS)
+
+
+def test_reproduce_writes_every_file(done: tuple[Path, Outcome]) -> None:
+    out, outcome = done
+    assert all(path.stat().st_size > 0 for path in outcome.files)
+    expected = {"figure1_error.png", "figure2_cost.svg", "figure3_cure.png", "runs.nc", "claims.md", "claims.json"}
+    assert expected <= {path.name for path in out.iterdir()}
+
+
+def test_runs_hold_every_iterate_by_regime_order_seed_and_step(done: tuple[Path, Outcome]) -> None:
+    runs = xarray.load_dataset(done[0] / "runs.nc", engine="h5netcdf")
+    for name in ("error", "cost"):
+        assert runs[name].dims == ("regime", "order", "seed", "step")
+        assert runs[name].shape == (3, 3, SETTINGS.seeds, SETTINGS.steps + 1)
+        assert np.isfinite(runs[name]).all()
+    assert json.loads(runs.attrs["settings"])["seeds"] == SETTINGS.seeds
+    assert "jax" in json.loads(runs.attrs["versions"])
+
+
+def test_runs_equal_single_solves_with_the_same_key(done: tuple[Path, Outcome]) -> None:
+    """The batched run is the public solver, and its recorded cost the public exact cost, to single precision."""
+    runs = xarray.load_dataset(done[0] / "runs.nc", engine="h5netcdf")
+    order, seed = 1, 2
+    problem = pc.experiments.stock_market("descending", growth=REGIMES["stable"])
+    key = module._keys(SETTINGS, 2, 3 * SETTINGS.seeds)[order * SETTINGS.seeds + seed]
+    M0 = module._starts(module.stack_problems([problem]), SETTINGS, SETTINGS.seeds)[seed]
+    solver = pc.RSGD(SETTINGS.steps, SETTINGS.step_size / 60)
+    solution = pc.solve(problem, solver, M0, key=key)
+    stable = runs["stable_policy"].sel(regime="stable", order="descending").values
+    picked = runs.sel(regime="stable", order="descending", seed=seed)
+    error = np.sum((np.asarray(solution.history[:, 0]) - stable) ** 2, axis=(-2, -1))
+    np.testing.assert_allclose(picked["error"], error, rtol=1e-8)
+    cost = float(pc.expected_cost(problem, solution.M))
+    assert float(picked["cost"][-1]) == pytest.approx(cost, rel=1e-4)
+
+
+def test_claims_are_complete_and_existence_is_settled(done: tuple[Path, Outcome]) -> None:
+    claims = json.loads((done[0] / "claims.json").read_text())
+    assert all({"claim", "source", "statistic", "interval", "verdict"} <= set(claim) for claim in claims)
+    verdicts = {claim["verdict"] for claim in claims}
+    assert verdicts <= {"holds", "holds as completed", "does not hold"}
+    existence = next(claim for claim in claims if "existence" in claim["claim"])
+    assert existence["verdict"] == "does not hold"
+    assert existence["value"] <= 1e-11
+    printed = next(claim for claim in claims if "N(log ε_t" in claim["claim"])
+    assert printed["verdict"] == "does not hold"
+
+
+def test_finished_stages_are_read_and_give_the_same_claims(done: tuple[Path, Outcome], tmp_path: Path) -> None:
+    out, outcome = done
+    for stage in STAGES:
+        shutil.copy(out / f"{stage}.nc", tmp_path)
+    again = reproduce(tmp_path, SETTINGS)
+    assert all(again.seconds[stage] == 0 for stage in STAGES)
+    assert again.claims == outcome.claims
+
+
+def test_stage_of_other_settings_or_broken_is_not_reused(done: tuple[Path, Outcome], tmp_path: Path) -> None:
+    shutil.copy(done[0] / "sweep.nc", tmp_path)
+    (tmp_path / "runs.nc").write_bytes(b"cut short")
+    stages = module._Stages(tmp_path, SETTINGS.model_copy(update={"seed": 1}), fresh=False)
+    made = xarray.Dataset({"x": ((), 1.0)})
+    for name in ("sweep", "runs"):
+        assert float(stages.run(name, lambda: made)["x"]) == 1.0
+        assert "x" in xarray.load_dataset(tmp_path / f"{name}.nc", engine="h5netcdf")
+
+
+def test_reproduce_refuses_single_precision(tmp_path: Path) -> None:
+    jax.config.update("jax_enable_x64", False)
+    try:
+        with pytest.raises(RuntimeError, match="float64"):
+            reproduce(tmp_path, SETTINGS)
+    finally:
+        jax.config.update("jax_enable_x64", True)
+
+
+def _runs(final: float) -> xarray.Dataset:
+    """Made-up runs whose error goes geometrically from 10 to `final`, every regime, order and seed alike."""
+    steps = np.arange(101)
+    error = 10 * (final / 10) ** (steps / 100)
+    shape = (3, 3, 8, 101)
+    return xarray.Dataset(
+        {
+            "error": (("regime", "order", "seed", "step"), np.broadcast_to(error, shape)),
+            "cost": (("regime", "order", "seed", "step"), np.broadcast_to(100 + error, shape)),
+            "result": (("regime", "order", "seed"), np.full(shape[:3], "success")),
+            "stable_cost": (("regime", "order"), np.full((3, 3), 100.0)),
+        },
+        coords={**module._CASES, "step": steps},
+    )
+
+
+@pytest.mark.parametrize(("final", "decays", "diverges"), [(0.1, True, False), (100.0, False, True)])
+def test_verdicts_follow_the_data(final: float, decays: bool, diverges: bool) -> None:
+    runs = _runs(final)
+    for regime in ("stable", "general"):
+        assert (paper_claims._decays(runs, regime).verdict != "does not hold") is decays
+        assert (paper_claims._cost_converges(runs, regime, "").verdict != "does not hold") is decays
+    assert (paper_claims._diverge(runs).verdict != "does not hold") is diverges
+    assert paper_claims._cost_larger(runs).verdict == "does not hold"
+    assert paper_claims._order_negligible(runs).verdict == "holds as completed"

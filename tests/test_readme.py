@@ -1,0 +1,34 @@
+"""The examples of the README and of the documentation run as they stand."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+SNIPPETS = [
+    pytest.param(block, id=f"{page.name}-{number}")
+    for page in PAGES
+    for number, block in enumerate(re.findall(r"^```python\n(.*?)^```", page.read_text("utf-8"), re.M | re.S))
+]
+
+
+@pytest.mark.parametrize("snippet", SNIPPETS)
+def test_snippet_runs_as_printed(snippet: str) -> None:
+    exec(compile(snippet, "snippet", "exec"), {})
+
+
+def test_readme_example_finds_the_stable_policy() -> None:
+    block = re.findall(r"^```python\n(.*?)^```", PAGES[0].read_text("utf-8"), re.M | re.S)[0]
+    names: dict = {}
+    exec(compile(block, "README.md", "exec"), names)
+    pc, problem, stable = names["pc"], names["problem"], names["stable"]
+    assert float(pc.residual(problem, stable.M)) < 1e-11
+    start = float(((problem.initial_policy() - stable.M) ** 2).sum())
+    assert float(((names["sampled"].M - stable.M) ** 2).sum()) < 0.05 * start
+
+
+def test_readme_links_lead_to_files() -> None:
+    for target in re.findall(r"\]\(((?!http)[^)#]+)", PAGES[0].read_text("utf-8")):
+        assert (ROOT / target).exists(), target
