@@ -2,6 +2,7 @@
 
 import itertools
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -53,17 +54,9 @@ def test_prediction_mean_square_analysis_matches_its_closed_form():
     assert stability.spectral_radius(1.0) == pytest.approx(0.25, rel=1e-6)
 
 
-def ball_problem(seed, active):
-    problem = random_problem(seed, strength=0.3)
-    free = pc.solve(random_problem(seed, strength=0.3, bounded=False), pc.StablePoint(), throw=False)
-    return problem, free, active
-
-
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_derivative_of_the_best_response_matches_finite_differences_where_the_ball_is_active(seed):
     problem = random_problem(seed, strength=0.5)
-    import equinox as eqx
-
     problem = eqx.tree_at(lambda p: p.feasible_set.limit, problem, jnp.asarray(0.05))
     M = pc.solve(problem, pc.StablePoint()).M
     assert float(jnp.linalg.norm(M)) == pytest.approx(0.05)
@@ -197,7 +190,7 @@ def test_safe_step_keeps_descent_stable_and_four_thresholds_do_not():
 
 
 def test_strong_performativity_makes_the_local_test_only_local():
-    """Φ(M) = c / (1 + M²)-like: stable and contracting at M^PS, while far away the response moves much faster."""
+    """Φ(M) = 3 tanh(2(M - 2)) + M/10 contracts at each outer fixed point, and stretches sixfold between them."""
     one = np.ones((1, 1))
     problem = pc.PerformativeProblem(
         system=pc.LinearSystem(0 * one, -one),
@@ -208,7 +201,7 @@ def test_strong_performativity_makes_the_local_test_only_local():
             [one], np.array([0.1]), mean=lambda M: jnp.stack([0 * M[0], -1 + 3 * jnp.tanh(2 * (M[0] - 2)) + 0.1 * M[0]])
         ),
     )
-    certificate = pc.certify(problem, "sharp", samples=0, pairs=32)
+    certificate = pc.certify(problem, "sharp", samples=0, pairs=64)
     assert certificate.holds is True
     assert certificate.values["contraction_estimate"] > 1.5
     far = [pc.solve(problem, pc.RRM(), np.full((1, 1, 1), start)).M.item() for start in (-1.0, 4.0)]
@@ -232,6 +225,7 @@ def test_safe_step_refuses_an_unstable_mean_field_and_bad_safety():
 STOCK_THRESHOLDS = {"ascending": 0.0240, "random": 0.0090, "descending": 0.0046}
 
 
+@pytest.mark.slow
 def test_stock_threshold_predicts_which_orders_diverge_at_the_papers_step():
     problem = pc.experiments.stock_market("descending", 1.0)
     stability = mean_square_stability(problem, samples=192)

@@ -6,10 +6,12 @@ import matplotlib.pyplot as plt
 import numpy as np
 import xarray
 from matplotlib.axes import Axes
-from matplotlib.ticker import LogLocator, NullFormatter
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 from perfcontrol.config import ReproduceSettings
 from perfcontrol.plotting.style import ORDER_COLOURS, ORDER_MARKS, REGIME_TITLES, band, save_figure, styled
+from perfcontrol.report.paper_claims import share_that_left
 
 CEILING = 1e4  # of the error axis, relative to the first error: beyond it a run has left for good
 
@@ -40,17 +42,27 @@ def _log_axes(axes: Axes) -> None:
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.xaxis.set_minor_formatter(NullFormatter())
-    axes.yaxis.set_minor_formatter(NullFormatter())
-    axes.yaxis.set_major_locator(LogLocator(numticks=7))
 
 
 def _guide(axes: Axes, start: float, end: float, level: float) -> None:
-    """A 1/n line."""
-    n = np.array([start, end])
-    axes.plot(n, level * start / n, color="#555555", linestyle=(0, (4, 3)), linewidth=1)
+    """A 1/n line that ends at `level`."""
+    axes.plot([start, end], [level * end / start, level], color="#555555", linestyle=(0, (4, 3)), linewidth=1)
     axes.annotate(
-        r"$1/n$", (n[1], level * start / end), xytext=(-2, 5), textcoords="offset points", ha="right", color="#555555"
+        r"$1/n$",
+        (np.sqrt(start * end), level * np.sqrt(end / start)),
+        xytext=(-3, -3),
+        textcoords="offset points",
+        ha="right",
+        va="top",
+        color="#555555",
     )
+
+
+def _orders_legend(figure: Figure, axes: Axes) -> None:
+    """One legend of the orders below all panels."""
+    handles, labels = axes.get_legend_handles_labels()
+    labels = [rf"{label} order of $\varepsilon_t$" if label in ORDER_COLOURS else label for label in labels]
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
 
 
 def figure_error(runs: xarray.Dataset, path: Path) -> list[Path]:
@@ -58,6 +70,7 @@ def figure_error(runs: xarray.Dataset, path: Path) -> list[Path]:
     figure, panels = plt.subplots(1, 3, figsize=(7.4, 2.6), sharey=True, layout="constrained")
     steps = runs["step"].values[1:]
     first = float(runs["error"].isel(step=0).median())
+    lowest = float(runs["error"].median("seed").min())
     for axes, regime in zip(panels, REGIME_TITLES, strict=True):
         for order in ORDER_COLOURS:
             values = runs["error"].sel(regime=regime, order=order).values[:, 1:]
@@ -65,10 +78,10 @@ def figure_error(runs: xarray.Dataset, path: Path) -> list[Path]:
         _log_axes(axes)
         axes.set_title(REGIME_TITLES[regime])
         axes.set_xlabel("iteration $n$")
-        _guide(axes, steps[-1] / 20, steps[-1], 0.05 * first)
-    panels[0].set_ylim(float(runs["error"].min()) / 2, CEILING * first)
+        _guide(axes, steps[-1] / 30, steps[-1], lowest / 3)
+    panels[0].set_ylim(float(runs["error"].min()) / 5, CEILING * first)
     panels[0].set_ylabel(r"$\|M_n - M^{\mathrm{PS}}\|_F^2$")
-    panels[0].legend(title=r"order of $\varepsilon_t$", loc="lower left")
+    _orders_legend(figure, panels[0])
     return save_figure(figure, path)
 
 
@@ -93,7 +106,7 @@ def figure_cost(runs: xarray.Dataset, path: Path) -> list[Path]:
         axes.set_xlabel("iteration $n$")
     panels[0].set_ylabel(r"$C_T(M_n; M_n)$")
     panels[0].plot([], [], color="#555555", linestyle=":", linewidth=1, label=r"at $M^{\mathrm{PS}}$")
-    panels[0].legend(title=r"order of $\varepsilon_t$")
+    _orders_legend(figure, panels[0])
     return save_figure(figure, path)
 
 
@@ -105,25 +118,25 @@ def figure_cure(cure: xarray.Dataset, sweep: xarray.Dataset, settings: Reproduce
     for order in ORDER_COLOURS:
         band(left, steps, *_quantiles(cure["diminishing"].sel(order=order).values), order)
     _log_axes(left)
-    _guide(left, steps[-1] / 20, steps[-1], 0.35 * float(cure["diminishing"].isel({"step_diminishing": 0}).median()))
+    _guide(left, steps[-1] / 30, steps[-1], float(cure["diminishing"].median("seed").min()) / 2)
     left.set_title(rf"diminishing step ${settings.step_size:g}\cdot 10/(n+10)$")
     left.set_ylabel(r"$\|M_n - M^{\mathrm{PS}}\|_F^2$")
-    left.legend(title=r"order of $\varepsilon_t$", loc="lower left")
 
     for name, style in (("smaller", "-"), ("simplex", (0, (1, 1)))):
         n = cure[f"step_{name}"].values
         for order, colour in ORDER_COLOURS.items():
             values = cure[name].sel(order=order).values
             middle.plot(n, np.median(values, axis=0), color=colour, linestyle=style)
-    middle.plot([], [], color="#555555", label="five times smaller step")
+    middle.plot([], [], color="#555555", label="ten times smaller step")
     middle.plot([], [], color="#555555", linestyle=(0, (1, 1)), label="same step, simplex")
     _log_axes(middle)
     middle.set_title("constant step, cured (medians)")
+    middle.set_ylim(bottom=middle.get_ylim()[0] / 6)
     middle.legend(loc="lower left")
     for axes in (left, middle):
         axes.set_xlabel("iteration $n$")
 
-    away = ((sweep["relative_error"] > 1) | (sweep["result"] != "success")).mean("seed")
+    away = share_that_left(sweep)
     for order, colour in ORDER_COLOURS.items():
         right.plot(
             sweep["factor"],
@@ -136,18 +149,19 @@ def figure_cure(cure: xarray.Dataset, sweep: xarray.Dataset, settings: Reproduce
     right.axvline(1, color="#555555", linestyle=(0, (4, 3)), linewidth=1)
     right.annotate(
         "mean-square\nthreshold",
-        (1, 100),
-        xytext=(-4, -4),
+        (1, 0),
+        xytext=(5, 2),
         textcoords="offset points",
-        ha="right",
-        va="top",
+        ha="left",
+        va="bottom",
         color="#555555",
     )
     right.set_xscale("log")
-    ticks = [0.25, 0.5, 1, 2, 3]
+    ticks = [0.25, 0.5, 1, 2]
     right.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
     right.xaxis.set_minor_formatter(NullFormatter())
     right.set_xlabel("constant step / threshold")
     right.set_ylabel("seeds that diverge (%)")
     right.set_title("where divergence begins")
+    _orders_legend(figure, left)
     return save_figure(figure, path)

@@ -145,6 +145,13 @@ def _form_derivative(problem: PerformativeProblem, basis: Array, variances: Arra
     return jax.jvp(lambda theta: _form(problem, basis, theta), (variances,), (along,))[1]
 
 
+@eqx.filter_jit
+def _least_cost(problem: PerformativeProblem, variances: Array) -> Array:
+    """The smallest cost on the set at given variances."""
+    given, start = _with_variances(problem, variances), problem.initial_policy()
+    return exact_cost(given, respond(given, start).M, start)
+
+
 def _simplified(problem: PerformativeProblem) -> PerformativeProblem:
     """Without what does not enter the gradient for zero-mean noise: the initial state and the targets."""
     if float(jnp.max(jnp.abs(fixed_noise(problem).mean))) > 0:
@@ -263,9 +270,7 @@ def _modulus(problem: PerformativeProblem, ranges: ScaleRange) -> tuple[float, d
     values: dict[str, Any] = {"metric": G, "basis": basis}
     if float(np.abs(L[1:, :]).max()) == 0:
         return 0.0, values, "The reaction does not move the best response."
-    worst = _with_variances(problem, jnp.asarray(high, dtype))
-    start = problem.initial_policy()
-    level = float(exact_cost(worst, respond(worst, start).M, start))
+    level = float(_least_cost(problem, jnp.asarray(high, dtype)))
     stretch = float(scipy.linalg.eigh(L[1:, 1:], G, eigvals_only=True)[-1])
     height = largest_on_sublevel((L + L.T) / 2, form, level)
     return float(np.sqrt(max(stretch, 0.0) * max(height, 0.0))), values, ""

@@ -17,7 +17,7 @@ from jaxtyping import Array
 
 from perfcontrol._checks import InputError, check_integer, fail
 from perfcontrol.evaluate.best_response import respond
-from perfcontrol.evaluate.exact import exact_gradient, require_moments
+from perfcontrol.evaluate.exact import expected_gradient, require_moments
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.solvers import Result, Solution, StablePoint, solve
 from perfcontrol.theory.certificate import Assumption, Certificate, not_applicable
@@ -55,7 +55,7 @@ class LocalModel(NamedTuple):
 def local_model(problem: PerformativeProblem, M: Array) -> LocalModel:
     """The model at a stable policy M (free parameters)."""
     H, E = hessian(problem, M), reaction_jacobian(problem, M, M)
-    gradient = exact_gradient(problem, M, M)
+    gradient = expected_gradient(problem, M)
     small = 0.1 / max(float(np.linalg.norm(H, 2)), np.finfo(float).tiny)
     slope = projection_derivative(problem, M - small * gradient)
     basis = range_basis(slope)
@@ -124,7 +124,7 @@ def proves_absence(problem: PerformativeProblem) -> bool:
 
     def field(v: np.ndarray) -> np.ndarray:
         M = base + jnp.asarray(basis @ v, base.dtype).reshape(base.shape)
-        return basis.T @ np.asarray(exact_gradient(problem, M, M), dtype=float).reshape(-1)
+        return basis.T @ np.asarray(expected_gradient(problem, M), dtype=float).reshape(-1)
 
     q = basis.shape[1]
     origin = field(np.zeros(q))
@@ -158,13 +158,16 @@ def contraction_estimate(
     radius = problem.feasible_set.radius(problem.policy_shape)
     scale = float(1 + jnp.linalg.norm(center)) if radius is None else float(radius)
     draws = jax.random.normal(key, (2 * pairs, *problem.policy_shape), problem.dtype)
-    lengths = scale * jnp.tile(jnp.logspace(-3, 0, pairs), 2)[:, None, None, None]
     unit = draws / jnp.linalg.norm(draws.reshape(2 * pairs, -1), axis=1)[:, None, None, None]
-    policies = jax.vmap(problem.feasible_set.project)(center + lengths * unit)
+    reach = scale * jnp.logspace(-2, 0.5, pairs)[:, None, None, None]
+    first = center + reach * unit[:pairs]
+    # every other pair is close together, so that steep places count as much as distant ones
+    apart = jnp.where(jnp.arange(pairs)[:, None, None, None] % 2 == 0, reach, 0.02 * scale)
+    policies = jax.vmap(problem.feasible_set.project)(jnp.concatenate([first, first + apart * unit[pairs:]]))
     images = _responses(problem, policies)
     moved = jnp.linalg.norm((images[:pairs] - images[pairs:]).reshape(pairs, -1), axis=1)
-    apart = jnp.linalg.norm((policies[:pairs] - policies[pairs:]).reshape(pairs, -1), axis=1)
-    return float(jnp.max(jnp.where(apart > 1e-12, moved / jnp.where(apart > 0, apart, 1), 0)))
+    distance = jnp.linalg.norm((policies[:pairs] - policies[pairs:]).reshape(pairs, -1), axis=1)
+    return float(jnp.max(jnp.where(distance > 1e-12, moved / jnp.where(distance > 0, distance, 1), 0)))
 
 
 def obstacles(problem: PerformativeProblem) -> list[str]:
