@@ -16,18 +16,20 @@ class ReproduceSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    seeds: int = Field(32, ge=2, description="independent runs of each case")
-    steps: int = Field(1000, ge=100, description="iterations N of each run")
-    step_size: float = Field(0.01, gt=0, description="constant step on the stage average of the gradient")
-    feasible_set: Literal["rows", "simplex"] = Field("rows", description="row sums alone, or nonnegative as well")
-    initial_investment: float = Field(150.0, gt=0, description="q_1 of every stock")
-    rate: float = Field(0.05, description="riskless rate over the horizon")
-    trading_hours: float = Field(6.5, gt=0, lt=24, description="h, trading hours a day")
-    cure_seeds: int = Field(16, ge=2, description="runs of each case that show what cures divergence")
-    cure_steps: int = Field(3000, ge=100, description="iterations of those with a diminishing step")
-    sweep_seeds: int = Field(8, ge=2, description="runs per step size in the search for where divergence begins")
-    sweep_steps: int = Field(400, ge=50, description="iterations of each of those")
-    seed: int = Field(0, ge=0, description="root of all randomness")
+    seeds: int = Field(default=32, ge=2, description="independent runs of each case")
+    steps: int = Field(default=1000, ge=100, description="iterations N of each run")
+    step_size: float = Field(default=0.01, gt=0, description="constant step on the stage average")
+    feasible_set: Literal["rows", "simplex"] = Field(default="rows", description="row sums, or nonnegative as well")
+    initial_investment: float = Field(default=150.0, gt=0, description="q_1 of every stock")
+    rate: float = Field(default=0.05, description="riskless rate over the horizon")
+    trading_hours: float = Field(default=6.5, gt=0, lt=24, description="h, trading hours a day")
+    cure_seeds: int = Field(default=16, ge=2, description="runs of each case that show what cures divergence")
+    cure_steps: int = Field(default=3000, ge=100, description="iterations of those with a diminishing step")
+    sweep_seeds: int = Field(
+        default=8, ge=2, description="runs per step size in the search for where divergence begins"
+    )
+    sweep_steps: int = Field(default=400, ge=50, description="iterations of each of those")
+    seed: int = Field(default=0, ge=0, description="root of all randomness")
 
     @classmethod
     def quick(cls) -> "ReproduceSettings":

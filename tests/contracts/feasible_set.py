@@ -68,7 +68,7 @@ class SetContract:
         points, projected = self.projected()
         for M, P in zip(points, projected, strict=True):
             gaps = np.einsum("himn,imn->h", projected - P, M - P)
-            size = 1 + np.abs(M).max() * np.abs(projected - P).max() * M.size
+            size = 1 + np.abs(M).max() * max(np.abs(M).max(), np.abs(projected - P).max()) * M.size
             assert gaps.max() <= self.close() * size
 
     @pytest.mark.float32

@@ -7,7 +7,7 @@ import pytest
 
 import perfcontrol as pc
 from perfcontrol.evaluate.exact import cost_to_go, exact_cost
-from tests.evaluate.cases import BUILDERS, FiniteNoise, SmoothCost, case, normal, policies, random_psd, replaced
+from tests.evaluate.cases import BUILDERS, FiniteNoise, SmoothCost, case, normal, replaced
 from tests.oracles.lqr import infinite_horizon_cost, riccati_gain
 from tests.tools import assert_close, assert_refused, central_differences, relative_error
 
@@ -248,8 +248,3 @@ def test_exact_evaluation_refuses_what_it_cannot_evaluate(function):
 def test_total_gradient_refuses_another_deployed_policy():
     c = case("nothing reacts")
     assert_refused(lambda: pc.expected_gradient(c.problem, c.M, deployed=c.M, total=True), "deployed", "total=True")
-
-
-def test_random_weights_used_here_are_convex():
-    assert np.linalg.eigvalsh(random_psd(1, 3)).min() > 0
-    assert policies(1, 2)[0].shape == (2,)

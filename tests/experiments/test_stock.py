@@ -63,17 +63,17 @@ def test_stock_market_is_the_problem_that_the_paper_describes():
     assert_close(problem.noise.mean, np.repeat([0.0, 0.5], 10), 1e-12, 1e-6)
     assert_close(problem.noise.covariance, np.kron(np.ones((2, 2)), np.eye(10)) / 12, 1e-12, 1e-6)
     assert_close(problem.perturbation.log_sensitivity, np.log(stock_sensitivities("descending")), 1e-12, 1e-5)
-    M = np.arange(100.0).reshape(1, 10, 10)
+    M = np.asarray(problem.feasible_set.project(0.001 * np.arange(100.0).reshape(1, 10, 10)), dtype=float)
     assert_close(problem.lift(M)[0], np.kron(np.eye(2), M[0]))
     assert_close(problem.initial_policy(), np.full((1, 10, 10), EXPOSURE / 10), 1e-12, 1e-6)
 
-    paths = pc.simulate(problem, 0.001 * M, key=jax.random.key(0), samples=2)
+    paths = pc.simulate(problem, M, key=jax.random.key(0), samples=2)
     x, u, w = (np.asarray(array, dtype=float) for array in (paths.x, paths.u, paths.w))
     dense = np.asarray(jax.vmap(lambda draws: draws.dense())(paths.draws), dtype=float)
     close = tolerance(1e-9, 3e-3)
     for s in range(2):
         w_before = np.vstack([np.zeros(20), w[s]])
-        np.testing.assert_allclose(u[s], w_before @ np.kron(np.eye(2), 0.001 * M[0]).T, atol=close)
+        np.testing.assert_allclose(u[s], w_before @ np.kron(np.eye(2), M[0]).T, atol=close)
         forward = np.einsum("tij,tj->ti", 0.97 * np.eye(20) + dense[s], x[s, :-1]) + u[s, :-1] + w[s]
         np.testing.assert_allclose(x[s, 1:], forward, atol=close * max(1, np.abs(x).max()))
         cost = (x[s, :, :10] ** 2).sum() + (u[s, :, :10] ** 2).sum()

@@ -66,6 +66,19 @@ def test_stable_point_is_not_claimed_when_none_exists(mean, start):
             pc.solve(problem, SOLVER, start)
 
 
+def test_stable_point_takes_two_steps_and_the_answer_when_the_response_is_affine():
+    """Evaluate the start, minimise once, see that it does not contract, and let one Newton step be the last."""
+    problem = performative_prediction(1.5)
+    assert int(pc.solve(problem, SOLVER).steps) == 3
+
+
+def test_stable_point_never_minimises_again_after_newton_when_minimisation_expands():
+    problem = strongly_performative()
+    errors = jnp.sqrt(jnp.sum((pc.solve(problem, SOLVER).history - pc.solve(problem, SOLVER).M) ** 2, axis=(1, 2, 3)))
+    gaps = np.asarray(errors[np.argmax(np.asarray(errors) < 0.1) :])
+    assert np.all(np.diff(gaps) <= 0), "the error grows again near the stable policy"
+
+
 @pytest.mark.parametrize("slope", [8.0, 20.0])
 def test_stable_point_solves_the_fixed_point_equation_when_repeated_minimisation_cycles(slope):
     problem = strongly_performative(slope)

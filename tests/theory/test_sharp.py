@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import perfcontrol as pc
-from perfcontrol.evaluate.best_response import response_pushforward
 from perfcontrol.theory.local import hessian, reaction_jacobian
 from perfcontrol.theory.mean_square import leading_eigenvalue
 from perfcontrol.theory.sampled_jacobian import JacobianSamples
@@ -58,18 +57,16 @@ def test_prediction_mean_square_analysis_matches_its_closed_form():
 def test_derivative_of_the_best_response_matches_finite_differences_where_the_ball_is_active(seed):
     problem = random_problem(seed, strength=0.5)
     problem = eqx.tree_at(lambda p: p.feasible_set.limit, problem, jnp.asarray(0.05))
-    M = pc.solve(problem, pc.StablePoint()).M
+    M = problem.initial_policy()
+    for _ in range(60):
+        M = pc.best_response(problem, M)
     assert float(jnp.linalg.norm(M)) == pytest.approx(0.05)
     model = local_model(problem, M)
     assert model.damping is not None and model.basis.shape[1] == M.size - 1
-    push = response_pushforward(problem, M, M)
     for column, direction in zip(model.response_jacobian.T, model.basis.T, strict=True):
-        V = jnp.asarray(direction.reshape(M.shape))
-        step = 1e-5
+        V, step = jnp.asarray(direction.reshape(M.shape)), 1e-5
         central = (pc.best_response(problem, M + step * V) - pc.best_response(problem, M - step * V)) / (2 * step)
-        expected = model.basis.T @ np.asarray(central).reshape(-1)
-        np.testing.assert_allclose(column, expected, atol=1e-7)
-        np.testing.assert_allclose(column, model.basis.T @ np.asarray(push(V)).reshape(-1), atol=1e-8)
+        np.testing.assert_allclose(column, model.basis.T @ np.asarray(central).reshape(-1), atol=1e-7)
 
 
 def test_unconstrained_response_jacobian_is_minus_inverse_hessian_times_reaction():

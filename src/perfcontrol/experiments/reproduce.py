@@ -287,13 +287,13 @@ def sweep_stage(
     starts = _starts(runner.problems, settings, seeds)[seed]
     rule = _constant(jnp.asarray(step), len(step))
     cases = jnp.asarray(order + r * len(ORDERS))
-    state, last = None, None
     keys = _keys(settings, 4, len(step))
-    done = 0
-    for state, last in runner.iterates(cases, starts, keys, rule, settings.sweep_steps):  # noqa: B007: the last ones
-        done += CHUNK
+    final, done = None, 0
+    for state, visited in runner.iterates(cases, starts, keys, rule, settings.sweep_steps):
+        final, done = (state, visited), done + CHUNK
         progress("where divergence begins", done / settings.sweep_steps)
-    assert state is not None and last is not None
+    assert final is not None
+    state, last = final
     target = exact["M"].sel(regime="unstable").values[order]
     error = np.sum((np.asarray(last)[:, -1, 0] - target) ** 2, axis=(-2, -1)).reshape(grid)
     start = np.sum((np.asarray(starts)[:, 0] - target) ** 2, axis=(-2, -1)).reshape(grid)

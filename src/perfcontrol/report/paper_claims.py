@@ -153,7 +153,8 @@ def _order_negligible(runs: xarray.Dataset) -> Claim:
         interval,
         "holds as completed if the interval lies below 0.05: the orders differ by less than 5 % of the way to go",
         "holds as completed" if interval[1] < 0.05 else "does not hold",
-        f"Final over initial error: {_listed({k: float(np.median(v)) for k, v in ends.items()})}: negligible beside the "
+        f"Final over initial error: {_listed({k: float(np.median(v)) for k, v in ends.items()})}: negligible beside "
+        "the "
         f"error removed, yet the floors differ by a factor of {ratio:.1f}, larger where the large sensitivities come "
         "first.",
     )
@@ -362,7 +363,8 @@ def _stable_is_not_optimal(runs: xarray.Dataset) -> Claim:
         (min(ratios.values()), max(ratios.values())),
         "does not hold if the ratio exceeds 1.05 in some case; the interval spans the nine cases",
         "does not hold" if ratios[name] > 1.05 else "holds",
-        f"Stable is not optimal: the ratios are {_listed(ratios)}. Where large sensitivities come first, the way to the "
+        f"Stable is not optimal: the ratios are {_listed(ratios)}. Where large sensitivities come first, the way to "
+        "the "
         "stable policy leads past cheaper ones.",
     )
 

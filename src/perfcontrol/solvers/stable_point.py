@@ -33,6 +33,7 @@ class _Own(eqx.Module):
     unique: Array
     residual: Array  # relative natural residual of M
     limit: Array  # of ‖M‖
+    contracting: Array  # whether every step so far was one of minimisation that shrank the gap well
 
 
 class StablePoint(AbstractSolver):
@@ -65,11 +66,11 @@ class StablePoint(AbstractSolver):
     def init(self, problem: PerformativeProblem, M0: Array) -> State:
         # The first step moves nowhere and evaluates M0: one place that compiles the best response.
         far = jnp.asarray(jnp.inf, M0.dtype)
-        return start(M0, _Own(M0, far, jnp.zeros((), M0.dtype), jnp.asarray(True), far, far))
+        return start(M0, _Own(M0, far, jnp.zeros((), M0.dtype), jnp.asarray(True), far, far, jnp.asarray(True)))
 
     def step(self, problem: PerformativeProblem, state: State, key: Array | None) -> State:
         own = state.own
-        contracting = own.ratio <= CONTRACTING
+        contracting = own.contracting
         F = own.response - state.M
         direction = jax.lax.cond(contracting, lambda: F, lambda: _newton_direction(problem, state.M, own.response))
 
@@ -104,7 +105,9 @@ class StablePoint(AbstractSolver):
         result = Result.where(done | stalled, Result.success, Result.running)
         result = Result.where(finite, result, Result.nonfinite)
         good = finite & ~stalled
-        following = _Own(response.M, gap, ratio, response.unique, response.residual, limit)
+        # Newton once, Newton to the end: a step of minimisation would expand what a good Newton step has shrunk.
+        still = contracting & (ratio <= CONTRACTING)
+        following = _Own(response.M, gap, ratio, response.unique, response.residual, limit, still)
         kept = jax.tree.map(lambda new, old: jnp.where(good, new, old), following, own)
         return State(jnp.where(good, M, state.M), state.steps + 1, result, kept)
 
