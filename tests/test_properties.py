@@ -128,7 +128,6 @@ def several(problem, M, deployed, key):
     }
 
 
-together = eqx.filter_jit(several)
 stacked = eqx.filter_jit(eqx.filter_vmap(several))
 
 
@@ -139,7 +138,7 @@ def assert_same(value, reference, double=1e-10, single=1e-3):
 
 @few
 @given(st.lists(seeds, min_size=3, max_size=3, unique=True))
-def test_jit_and_vmap_over_stacked_problems_equal_single_calls(drawn):
+def test_compiled_vmap_over_stacked_problems_equals_single_calls(drawn):
     drawn = [data(seed, *SHAPE) for seed in drawn]
     problems = [build(d, SHAPE[3]) for d in drawn]
     keys = jax.random.split(jax.random.key(1), 3)
@@ -150,7 +149,6 @@ def test_jit_and_vmap_over_stacked_problems_equal_single_calls(drawn):
     pair = [jnp.asarray(np.stack([d[name] for d in drawn])) for name in ("M", "deployed")]
     batch = stacked(jax.tree.map(lambda *leaves: jnp.stack(leaves), *problems), *pair, keys)
     for i, single in enumerate(singles):
-        assert_same(together(problems[i], pair[0][i], pair[1][i], keys[i]), single)
         assert_same({name: value[i] for name, value in batch.items()}, single)
 
 
@@ -231,7 +229,7 @@ def test_single_precision_answers_like_double_precision():
     single = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), double)
     M, deployed = (jnp.asarray(d[name], jnp.float32) for name in ("M", "deployed"))
     assert single.dtype == jnp.float32
-    rough = together(single, M, deployed, jax.random.key(1))
+    rough = several(single, M, deployed, jax.random.key(1))
     exact = several(double, jnp.asarray(d["M"]), jnp.asarray(d["deployed"]), jax.random.key(1))
     for name in ("cost", "gradient", "response", "moments"):
         assert rough[name].dtype == jnp.float32
@@ -267,5 +265,4 @@ def test_twenty_problems_with_swept_parameters_are_traced_once():
         after.append(len(traces))
     # Entry checks look at shapes by an abstract trace; what is compiled is traced for the first problem alone.
     assert len(set(np.diff(after[1:]))) == 1
-    per_problem = after[1] - after[0] if len(after) > 1 else 0
-    assert per_problem <= 4, f"{per_problem} traces for each further problem"
+    assert after[1] - after[0] <= 2, f"{after[1] - after[0]} traces for each further problem"

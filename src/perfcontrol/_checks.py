@@ -144,7 +144,8 @@ def check_key(key: Any) -> Any:
         raise fail("key", repr(key), "be a JAX random key", f"Pass key=jax.random.key({key}).")
     if not isinstance(key, jax.Array):
         raise fail("key", type(key).__name__, "be a JAX random key", "Pass key=jax.random.key(0).")
-    return key
+    # raw keys of jax.random.PRNGKey draw the same numbers as their typed form
+    return jax.random.wrap_key_data(key) if key.dtype == jnp.uint32 else key
 
 
 def check_tolerance(tolerance: float | None, dtype: Any) -> float:

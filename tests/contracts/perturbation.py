@@ -104,7 +104,7 @@ class PerturbationContract:
 
     @pytest.mark.float32
     def test_draws_are_operators_that_match_dense_and_the_key(self):
-        """Three draws come back from one batched program and serve a second one; the same keys give the same numbers."""
+        """Draws come back from one batched program and serve a second one; the same keys give the same numbers."""
         law, policies, draws = self.drawn()
         keys = jax.random.split(jax.random.key(7), self.samples)[:3]
         z, y = normal(41, self.horizon, self.columns()), normal(42, self.horizon, self.shape[2])

@@ -80,7 +80,7 @@ class RandomVectorContract:
         assert_close(eqx.filter_jit(lambda law, key: law.sample(key, draws.shape[1]))(law, first), draws[0])
 
     def test_law_is_an_immutable_pytree(self):
-        law, draws = self.drawn()
+        law, _ = self.drawn()
         leaves, structure = jax.tree.flatten(law)
         again = jax.tree.unflatten(structure, leaves)
         assert_close(again.mean, law.mean, 0, 0)

@@ -164,7 +164,8 @@ def test_constrained_best_response_matches_cvxpy_and_its_variational_inequality(
 
 
 def test_best_response_inside_a_ball_is_the_unconstrained_one():
-    assert_close(answer(make(feasible_set=pc.FrobeniusBall(100.0)), DEPLOYED), answer(make(), DEPLOYED), 1e-9)  # fmt: skip
+    problem = make(feasible_set=pc.FrobeniusBall(100.0))
+    assert_close(answer(problem, DEPLOYED), answer(make(), DEPLOYED), 1e-9)
 
 
 SINGULAR = pc.Gaussian(np.zeros(n), np.outer([1.0, 2.0, -1.0], [1.0, 2.0, -1.0]))

@@ -167,6 +167,7 @@ def test_multiplicative_noise_lqr_cost_matches_the_lyapunov_oracle_for_another_g
     assert float(cost) == pytest.approx(expected, rel=1e-7)
 
 
+@pytest.mark.slow
 def test_best_policy_approaches_the_lqr_optimum_as_the_memory_grows():
     """Without multiplicative noise, from x_0 = 0, around any stabilising gain."""
     A, B, Q, R = np.array([[0.9, 0.5], [0.0, 0.7]]), np.array([[0.0], [1.0]]), np.eye(2), np.eye(1)

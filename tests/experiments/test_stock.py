@@ -63,7 +63,7 @@ def test_stock_market_is_the_problem_that_the_paper_describes():
     assert_close(problem.noise.mean, np.repeat([0.0, 0.5], 10), 1e-12, 1e-6)
     assert_close(problem.noise.covariance, np.kron(np.ones((2, 2)), np.eye(10)) / 12, 1e-12, 1e-6)
     assert_close(problem.perturbation.log_sensitivity, np.log(stock_sensitivities("descending")), 1e-12, 1e-5)
-    M = np.asarray(problem.feasible_set.project(0.001 * np.arange(100.0).reshape(1, 10, 10)), dtype=float)
+    M = np.asarray(problem.feasible_set.project(0.001 * jnp.arange(100.0).reshape(1, 10, 10)), dtype=float)
     assert_close(problem.lift(M)[0], np.kron(np.eye(2), M[0]))
     assert_close(problem.initial_policy(), np.full((1, 10, 10), EXPOSURE / 10), 1e-12, 1e-6)
 

@@ -12,10 +12,10 @@ LOW, WIDTH = normal(1, 2, 2, 3), jnp.abs(normal(2, 2, 2, 3)).at[0, 1, 2].set(0.0
 
 class TestBoxOfNumbers(SetContract):
     def feasible_set(self):
-        return pc.Box(-0.3, 0.8)
+        return pc.Box(-0.8, 0.3)
 
     def constraints(self, M):
-        return [lag >= -0.3 for lag in M] + [lag <= 0.8 for lag in M]
+        return [lag >= -0.8 for lag in M] + [lag <= 0.3 for lag in M]
 
 
 class TestBoxOfArraysWithOneFixedEntry(SetContract):

@@ -60,6 +60,6 @@ def test_inverse_step_is_refused_when_not_positive(name, phis):
 
 
 def test_lazy_schedule_deploys_every_so_many_steps():
-    assert [bool(pc.Lazy(3).deploys(n)) for n in range(7)] == [True, False, False, True, False, False, True]
-    assert all(bool(pc.Greedy().deploys(n)) for n in range(3))
+    assert [bool(pc.Lazy(3).deploys(n)) for n in jnp.arange(7)] == [True, False, False, True, False, False, True]
+    assert all(bool(pc.Greedy().deploys(n)) for n in STEPS)
     assert_refused(lambda: pc.Lazy(0), "steps", "at least 1")

@@ -28,6 +28,6 @@ class Exact(eqx.Module):
         require_moments(problem)
 
     def __call__(
-        self, problem: PerformativeProblem, M: Array, deployed: Array, key: Key[Array, ""], batch: int
+        self, problem: PerformativeProblem, M: Array, deployed: Array, key: Key[Array, ""] | None, batch: int
     ) -> Array:
         return exact_gradient(problem, M, deployed)
