@@ -73,6 +73,17 @@ def as_array(name: str, value: Any) -> Array:
     return array
 
 
+def check_finite(what: str, answer: Any) -> Any:
+    """`answer` where all its numbers are finite (or traced); raise OverflowError otherwise."""
+    for leaf in jax.tree.leaves(answer):
+        if is_concrete(leaf) and not np.all(np.isfinite(np.asarray(leaf))):
+            raise OverflowError(
+                f"{what} overflows {leaf.dtype.name} at this policy: the second moments of the state grow too fast over "
+                "the horizon. Use a policy of smaller norm, a shorter horizon, or a gain that stabilises the system."
+            )
+    return answer
+
+
 def check_shape(name: str, array: Any, expected: Sequence[int], labels: Sequence[str], remedy: str = "") -> None:
     """Raise unless `array.shape == expected`; `labels` names the axes."""
     expected = tuple(expected)

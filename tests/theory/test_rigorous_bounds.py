@@ -91,7 +91,7 @@ def extreme_policy(problem, rng, radius):
 
 
 @pytest.mark.parametrize("cost", ["quadratic", "log cosh"])
-@settings(max_examples=12, deadline=None, derandomize=True)
+@settings(max_examples=6, deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 10_000),
     shape=st.sampled_from(list(SHAPES)),
@@ -105,7 +105,7 @@ def test_pathwise_bounds_are_never_exceeded(cost, seed, shape, skew, growth):
     first = extreme_policy(problem, rng, items.policy_bound)
     second = first + rng.standard_normal() * 0.1 * extreme_policy(problem, rng, 1.0)
     second *= min(1, items.policy_bound / np.linalg.norm(second))
-    paths = paths_of(problem, items, rng, 6, first)
+    paths = paths_of(problem, items, rng, 4, first)
     gradients, x, u = stage_policy_gradients(problem, cost, first, paths)
     others, _, _ = stage_policy_gradients(problem, cost, second, paths)
     k = int(rng.integers(0, problem.horizon))

@@ -53,7 +53,8 @@ def test_prediction_mean_square_analysis_matches_its_closed_form():
     assert stability.spectral_radius(1.0) == pytest.approx(0.25, rel=1e-6)
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
 def test_derivative_of_the_best_response_matches_finite_differences_where_the_ball_is_active(seed):
     problem = random_problem(seed, strength=0.5)
     problem = eqx.tree_at(lambda p: p.feasible_set.limit, problem, jnp.asarray(0.05))
@@ -133,6 +134,7 @@ def test_threshold_by_one_eigenvalue_matches_bisection_on_the_spectral_radius():
     )
 
 
+@pytest.mark.slow
 def test_error_floor_matches_simulation_at_a_safe_step():
     problem = random_problem(3, bounded=False, strength=0.05)
     M = pc.solve(problem, pc.StablePoint()).M
@@ -150,6 +152,7 @@ def test_error_floor_matches_simulation_at_a_safe_step():
     assert errors.mean() == pytest.approx(stability.error_floor(step), abs=5 * spread + 0.1 * errors.mean())
 
 
+@pytest.mark.slow
 def test_products_with_probes_match_the_matrices():
     problem = random_problem(3, bounded=False, strength=0.2)
     M = pc.solve(problem, pc.StablePoint()).M

@@ -228,7 +228,7 @@ def test_transport_says_which_package_is_missing(monkeypatch):
 def test_sensitivity_estimates_refuse_bad_input():
     problem = random_problem(0, "scalar")
     with pytest.raises(pc.InputError, match="method"):
-        pc.estimate_sensitivity(problem, method="guess")  # type: ignore[arg-type]
+        pc.estimate_sensitivity(problem, method="guess")
     with pytest.raises(pc.InputError, match="key"):
         pc.estimate_sensitivity(problem)
 

@@ -22,6 +22,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from perfcontrol._checks import check_finite
 from perfcontrol._linalg import symmetrise
 from perfcontrol.evaluate.exact import (
     CostToGo,
@@ -168,7 +169,9 @@ def natural_residual(problem: PerformativeProblem, world: CostToGo, M: Array, st
     at_zero, at_M = jax.vmap(_gradient_at(problem, world))(jnp.stack([jnp.zeros_like(M), M]))
     moved = _norm(M - problem.feasible_set.project(M - step * at_M))
     scale = _norm(M) + step * _norm(at_zero)
-    return moved / jnp.where(scale > 0, scale, 1)
+    relative = moved / jnp.where(scale > 0, scale, 1)
+    # A world that overflows has a zero step, and would pass for stable.
+    return jnp.where(jnp.all(jnp.isfinite(at_M)) & (step > 0), relative, jnp.inf)
 
 
 # --- methods: each minimises one quadratic over its kind of set, and gives Newton steps at a minimiser ---------------
@@ -401,9 +404,11 @@ def respond(problem: PerformativeProblem, deployed: Array, start: Array | None =
         (cost_to_go(problem, problem.structure.lift(deployed)), deployed if start is None else start)
     )
     method = _method(problem, world)
-    return Response(
-        *jax.lax.stop_gradient((*method.minimise(start), natural_residual(problem, world, deployed, method.step)))
-    )
+    M, unique = method.minimise(start)
+    residual = natural_residual(problem, world, deployed, method.step)
+    # Pseudo-inverses turn an overflow into finite nonsense: no number at all is the honest answer.
+    M = jnp.where(jnp.isfinite(residual), M, jnp.nan)
+    return Response(*jax.lax.stop_gradient((M, unique, residual)))
 
 
 def response_pushforward(problem: PerformativeProblem, deployed: Array, response: Array) -> Operator:
@@ -452,7 +457,7 @@ def best_response(problem: PerformativeProblem, deployed: Any) -> Array:
     """
     deployed = problem.check_policy("deployed", deployed)
     require_moments(problem)
-    return _compiled_respond(problem, deployed)
+    return check_finite("the best response", _compiled_respond(problem, deployed))
 
 
 def residual(problem: PerformativeProblem, M: Any, *, deployed: Any = None) -> Array:
@@ -462,4 +467,4 @@ def residual(problem: PerformativeProblem, M: Any, *, deployed: Any = None) -> A
     """
     M, reacting = check_pair(problem, M, deployed)
     require_moments(problem)
-    return _compiled_residual(problem, M, reacting)
+    return check_finite("the residual", _compiled_residual(problem, M, reacting))

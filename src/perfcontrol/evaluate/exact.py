@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from perfcontrol._checks import fail
+from perfcontrol._checks import check_finite, fail
 from perfcontrol._linalg import Matrix, along_time, as_dense, congruence, matvec, rmatvec, symmetrise, transpose
 from perfcontrol.costs import QuadraticCost
 from perfcontrol.evaluate.rollout import check_pair, input_adjoint, input_term
@@ -302,7 +302,7 @@ def expected_cost(problem: PerformativeProblem, M: Any, *, deployed: Any = None)
     """
     M, reacting = check_pair(problem, M, deployed)
     require_moments(problem)
-    return _compiled_cost(problem, M, reacting)
+    return check_finite("the expected cost", _compiled_cost(problem, M, reacting))
 
 
 def expected_gradient(problem: PerformativeProblem, M: Any, *, deployed: Any = None, total: bool = False) -> Array:
@@ -320,7 +320,7 @@ def expected_gradient(problem: PerformativeProblem, M: Any, *, deployed: Any = N
     M, reacting = check_pair(problem, M, deployed)
     require_moments(problem)
     if not total:
-        return _compiled_gradient(problem, M, reacting)
+        return check_finite("the expected gradient", _compiled_gradient(problem, M, reacting))
     if deployed is not None:
         raise fail(
             "deployed",
@@ -328,4 +328,4 @@ def expected_gradient(problem: PerformativeProblem, M: Any, *, deployed: Any = N
             "be left out for the total gradient",
             "The total derivative moves both policies together.",
         )
-    return _total_gradient(problem, M)
+    return check_finite("the total gradient", _total_gradient(problem, M))

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from perfcontrol._checks import check_finite
 from perfcontrol._linalg import along_time, symmetrise
 from perfcontrol.evaluate.exact import mean_dynamics, require_moments
 from perfcontrol.evaluate.rollout import check_pair
@@ -115,11 +116,11 @@ def state_moments(problem: PerformativeProblem, M: Any, *, deployed: Any = None)
     """
     M, reacting = check_pair(problem, M, deployed)
     require_moments(problem)
-    return _compiled_moments(problem, M, reacting)
+    return check_finite("the state moments", _compiled_moments(problem, M, reacting))
 
 
 def expected_cost_by_moments(problem: PerformativeProblem, M: Any, *, deployed: Any = None) -> Array:
     """`expected_cost` by the forward moment recursion: slower, kept as an independent check of the engine."""
     M, reacting = check_pair(problem, M, deployed)
     require_moments(problem)
-    return _compiled_cost(problem, M, reacting)
+    return check_finite("the expected cost", _compiled_cost(problem, M, reacting))

@@ -102,13 +102,16 @@ class StablePoint(AbstractSolver):
         done = gap <= 0.1 * tolerance * jnp.where(scale > 0, scale, 1)
         # A Newton step that no longer helps has reached rounding, or is stuck: `finish` tells which by the residual.
         stalled = ~contracting & ~helps(M, gap)
+        # A step of minimisation that widens the gap is taken back, and Newton goes on from where it started.
+        widened = contracting & (state.steps > 0) & ~(gap < own.gap) & ~done
         result = Result.where(done | stalled, Result.success, Result.running)
-        result = Result.where(finite, result, Result.nonfinite)
-        good = finite & ~stalled
+        result = Result.where(finite | widened, result, Result.nonfinite)
+        good = finite & ~stalled & ~widened
         # Newton once, Newton to the end: a step of minimisation would expand what a good Newton step has shrunk.
         still = contracting & (ratio <= CONTRACTING)
         following = _Own(response.M, gap, ratio, response.unique, response.residual, limit, still)
         kept = jax.tree.map(lambda new, old: jnp.where(good, new, old), following, own)
+        kept = eqx.tree_at(lambda k: k.contracting, kept, kept.contracting & ~widened)
         return State(jnp.where(good, M, state.M), state.steps + 1, result, kept)
 
     def finish(self, problem: PerformativeProblem, state: State, stopped: bool) -> tuple[Result, dict[str, Array]]:

@@ -61,7 +61,7 @@ class Ingredients:
 
 
 def _spectral(matrices: Any) -> np.ndarray:
-    return np.linalg.norm(np.asarray(matrices, dtype=float), ord=2, axis=(-2, -1))
+    return np.asarray(np.linalg.norm(np.asarray(matrices, dtype=float), ord=2, axis=(-2, -1)))
 
 
 def quadratic_constants(problem: PerformativeProblem) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

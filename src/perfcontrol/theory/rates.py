@@ -9,7 +9,7 @@ and for η_0 ≤ min(m/L², 1/m), η_n/η_{n+1} ≤ 1 + m η_{n+1}/2:  E_N ≤ �
 """
 
 import math
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -133,7 +133,7 @@ def rsgd_error_bound(
     *,
     batch: int = 1,
     kind: str = "rigorous",
-    form: Literal["recursion", "closed", "printed"] = "recursion",
+    form: str = "recursion",
     **declared: Any,
 ) -> np.ndarray:
     """A bound of E ‖M_n - M^PS‖²_F along RSGD for n = 0..steps, (steps+1,).

@@ -1,0 +1,1 @@
+"""Measurements, never tests: `python -m benchmarks` for speed, `python -m benchmarks.certificates` for certificates."""

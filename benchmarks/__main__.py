@@ -1,0 +1,19 @@
+"""`python -m benchmarks [--quick] [--out FILE]`: the table of speeds, everything in one process."""
+
+import argparse
+from pathlib import Path
+
+import jax
+
+jax.config.update("jax_enable_x64", True)
+
+from benchmarks import speed  # noqa: E402 - after the precision is set
+
+parser = argparse.ArgumentParser(description="Speed of gradients, exact evaluation and stable points.")
+parser.add_argument("--quick", action="store_true", help="the small shapes only")
+parser.add_argument("--out", type=Path, help="also write the table as Markdown")
+arguments = parser.parse_args()
+text = speed.table(arguments.quick)
+print(text)
+if arguments.out is not None:
+    arguments.out.write_text(text + "\n", encoding="utf-8")
