@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import perfcontrol as pc
 from perfcontrol.theory.constants import products, rigorous_constants
 from perfcontrol.theory.ingredients import gather
 from perfcontrol.theory.strong_stability import candidates
@@ -134,8 +135,6 @@ def test_pathwise_bounds_are_never_exceeded(cost, seed, shape, skew, growth):
 
 def test_bounds_are_attained_by_a_scalar_problem_without_slack():
     """n = m = H = 1, K = 0, Δ = 0, constant noise: every inequality of the state and of λ_t is an equality."""
-    import perfcontrol as pc
-
     problem = pc.PerformativeProblem(
         system=pc.LinearSystem([[0.9]], [[1.0]]),
         horizon=6,
@@ -162,3 +161,68 @@ def test_products_match_their_definition():
     for t in range(5):
         for k in range(4):
             assert table[t, k] == pytest.approx(np.prod(factors[k + 1 : t]) if k < t else 0.0)
+
+
+def test_growth_bound_carries_the_condition_of_the_transform():
+    """Ã = 0.9 [[0, κ²], [κ⁻², 0]] with Δ = 0.1 e₂e₁ᵀ: powers grow at √(0.81 + 0.09κ²), far above 0.9 + 0.1."""
+    kappa, T = 3.0, 40
+    A, D = 0.9 * np.array([[0, kappa**2], [kappa**-2, 0]]), np.array([[0.0, 0.0], [1.0, 0.0]])
+    problem = pc.PerformativeProblem(
+        system=pc.LinearSystem(A, np.eye(2)),
+        horizon=T,
+        noise=pc.Constant([0.0, 0.0]),
+        cost=pc.QuadraticCost(np.eye(2), np.eye(2)),
+        perturbation=pc.DirectionalPerturbation([D], np.array([0.1])),
+        feasible_set=pc.FrobeniusBall(1.0),
+        initial_state=[1.0, 0.0],
+    )
+    items = gather(problem)
+    x = [np.array([1.0, 0.0])]
+    for _ in range(T):
+        x.append((A + 0.1 * D) @ x[-1])
+    for stability in candidates(problem.system, np.zeros((2, 2)), items.perturbation_bound):
+        assert np.all(np.linalg.norm(x, axis=1) <= SLACK * rigorous_constants(items, stability).state_bound)
+
+
+def test_smoothness_in_the_policy_is_attained_where_the_gain_dominates():
+    """Scalar, A - BK = 0.9, K = 5: noise that turns its sign at the end reaches λ_T up to the missing w_{-1}."""
+    T = 60
+    problem = pc.PerformativeProblem(
+        system=pc.LinearSystem([[5.9]], [[1.0]]),
+        horizon=T,
+        noise=pc.Rademacher(1.0),
+        cost=pc.QuadraticCost([[0.5]], [[0.5]]),
+        gain=[[5.0]],
+        feasible_set=pc.FrobeniusBall(1.0),
+    )
+    items = gather(problem)
+    bound = rigorous_constants(items, next(candidates(problem.system, np.array([[5.0]]), items.perturbation_bound)))
+    w = np.ones(T)
+    w[-1] = -1.0
+    dx = sum(0.9 ** (T - 1 - i) * w[i - 1] for i in range(1, T))
+    du = -5.0 * dx + w[-1]
+    assert 0.98 * bound.smoothness[-1] <= dx**2 + du**2 <= SLACK * bound.smoothness[-1]
+
+
+def test_propagation_through_the_products_is_counted():
+    """Scalar, x_k = 0: Δ_k moves the gradient through the product Φ_{t,i} and the curvature alone."""
+    T, k = 12, 6
+    problem = pc.PerformativeProblem(
+        system=pc.LinearSystem([[0.9]], [[1.0]]),
+        horizon=T,
+        noise=pc.Rademacher(1.0),
+        cost=pc.QuadraticCost([[0.5]], [[0.5]], state_target=[1000.0]),
+        feasible_set=pc.FrobeniusBall(1.0),
+    )
+    items = gather(problem)
+    bound = rigorous_constants(items, next(candidates(problem.system, np.zeros((1, 1)), items.perturbation_bound)))
+
+    def last_gradient(delta):
+        x = dx = 0.0
+        for t in range(T):
+            factor = 0.9 + (delta if t == k else 0.0)
+            x, dx = factor * x + (1.0 if t else 0.0) + 1.0, factor * dx + (1.0 if t else 0.0)
+        return (x - 1000.0) * dx
+
+    slope = abs(last_gradient(1e-6) - last_gradient(-1e-6)) / 2e-6
+    assert 0.5 * bound.propagation[T, k] <= slope <= SLACK * bound.propagation[T, k]

@@ -117,6 +117,7 @@ def test_threshold_matches_enumeration_of_every_path_where_the_law_is_fixed():
     batched = mean_square_stability(enumerated_problem(), samples=4096, batch=4)
     mean, square = np.mean(jacobians), np.mean(np.square(jacobians))
     assert batched.threshold_estimate == pytest.approx(2 * mean / (square / 4 + 0.75 * mean**2), rel=0.02)
+    assert batched.spectral_radius(batched.threshold_estimate) == pytest.approx(1.0, abs=0.02)
 
 
 def test_threshold_by_one_eigenvalue_matches_bisection_on_the_spectral_radius():
