@@ -34,7 +34,9 @@ def problem_of(n: int, H: int, T: int, kind: str = "dense") -> pc.PerformativePr
         perturbation = pc.DensePerturbation(lambda M: 0.1 / n * jnp.sqrt(1 + jnp.sum(M**2) / n), law="rademacher")
     else:
         directions = r.standard_normal((2, n, n)) / n
-        perturbation = pc.DirectionalPerturbation(directions, lambda M: 0.1 * jnp.sqrt(1 + jnp.sum(M**2) / n) * jnp.ones(2))
+        perturbation = pc.DirectionalPerturbation(
+            directions, lambda M: 0.1 * jnp.sqrt(1 + jnp.sum(M**2) / n) * jnp.ones(2)
+        )
     return pc.PerformativeProblem(
         system=pc.LinearSystem(A, r.standard_normal((n, n)) / np.sqrt(n)),
         horizon=T,

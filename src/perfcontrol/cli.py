@@ -107,6 +107,63 @@ def reproduce(
     console.print(f"{len(outcome.files)} files in {out}; {time.monotonic() - began:.1f} s ({spent}).")
 
 
+@app.command()
+def certify(
+    name: Annotated[Literal["stock"], typer.Argument(help="Built-in problem.")] = "stock",
+    order: Annotated[
+        Literal["ascending", "descending", "random"], typer.Option(help="Order of the sensitivities over time.")
+    ] = "ascending",
+    growth: Annotated[float, typer.Option(help="rho in A = rho I.")] = 1.0,
+    feasible_set: Annotated[
+        Literal["rows", "simplex"], typer.Option(help="Row sums, or nonnegative as well.")
+    ] = "rows",
+    batch: Annotated[int, typer.Option(help="Paths per step, for the safe step.", min=1)] = 1,
+    kind: Annotated[
+        list[Literal["paper", "rigorous", "global", "sharp"]] | None, typer.Option(help="Certificates (all).")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Also write the verdicts to this JSON file.")] = None,
+) -> None:
+    """Say whether a stable policy exists, how fast it is reached, and which step is safe; and how each is known.
+
+    The exit status is 0 if a certificate holds and 3 if none does.
+    """
+    _configure_jax()
+    from perfcontrol.experiments.stock import stock_market
+    from perfcontrol.theory import verdict_rows
+
+    problem = stock_market(order, growth=growth, feasible_set=feasible_set)
+    kinds = tuple(kind) if kind else ("paper", "rigorous", "global", "sharp")
+    with console.status("certifying"):
+        rows = verdict_rows(problem, kinds, batch=batch)
+    table = Table(
+        "certificate", "applicable", "holds", "exists", "left", "right", "rate", title=f"{name}, {order}, {growth:g}"
+    )
+    for row in rows:
+        shown = [_shown(row[key]) for key in ("applicable", "holds", "exists", "lhs", "rhs", "rate")]
+        table.add_row(row["kind"], *shown)
+    console.print(table)
+    for row in rows:
+        console.print(f"{row['kind']}: {row['text']}", highlight=False, markup=False)
+    if out is not None:
+        from perfcontrol import results
+
+        try:
+            results.save_json(rows, out)
+        except OSError as error:
+            errors.print(f"error: cannot write to {out}: {error}", style="red")
+            raise typer.Exit(1) from None
+    raise typer.Exit(0 if any(row["holds"] for row in rows) else 3)
+
+
+def _shown(value: Any) -> str:
+    """A table cell."""
+    if value is None:
+        return "unknown"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return value if isinstance(value, str) else f"{value:.3g}"
+
+
 def main() -> None:
     """Entry point of the `perfcontrol` command."""
     app()

@@ -93,7 +93,8 @@ class Uniform(_Entrywise):
     """Independent entries, uniform on [low_i, high_i].
 
     Args:
-        low, high: (n,) or a number, in the units of the state.
+        low: (n,) or a number, in the units of the state.
+        high: likewise, not below `low`.
 
     Raises:
         InputError: shapes that do not fit, or low > high.

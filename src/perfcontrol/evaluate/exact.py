@@ -292,7 +292,8 @@ def expected_cost(problem: PerformativeProblem, M: Any, *, deployed: Any = None)
 
     Args:
         problem: with a QuadraticCost and a perturbation of known moments.
-        M, deployed: free policy parameters, `problem.policy_shape`.
+        M: free policy parameters, `problem.policy_shape`.
+        deployed: likewise; None for M itself.
 
     Returns:
         A scalar.

@@ -14,7 +14,8 @@ class Box(AbstractSet):
     """{M : low ≤ M ≤ high, entry by entry}.
 
     Args:
-        low, high: a number or one per free parameter, (memory, input, state); -inf and inf leave entries free.
+        low: a number or one per free parameter, (memory, input, state); -inf and inf leave entries free.
+        high: likewise, not below `low`.
 
     Raises:
         InputError: low > high somewhere (the set is empty), or arrays that do not fit the policy.

@@ -24,8 +24,9 @@ from perfcontrol._linalg import symmetrise, transpose
 from perfcontrol.sets.base import AbstractSet
 
 SWEEPS = 20  # of Dykstra between two Newton steps
-ROUNDS = 12  # of sweeps and a Newton step in a stage, at most
-STAGES = 60  # on the way to a point far outside, at most
+ROUNDS = 12  # of sweeps and a Newton step in a stage, at first; doubled when a stage fails
+MOST_ROUNDS = 400
+STAGES = 40  # on the way to a point far outside, at most
 LENGTHS = (1.0, 0.5, 0.25, 0.1, 0.03)  # of Newton steps
 NEWTON_LIMIT = 512  # free parameters up to which derivatives of projections are held as matrices
 ACCURACY = 1e-8  # what a projection promises, relative
@@ -107,6 +108,7 @@ class _Progress(eqx.Module):
     parts: Float[Array, "k p"]  # there
     tried: Float[Array, ""]
     split: _Split  # of the last trial
+    rounds: Int[Array, ""]
     count: Int[Array, ""]
 
 
@@ -120,27 +122,28 @@ def _solve(sets: Sets, M: Array) -> _Split:
     shape, dtype = M.shape, M.dtype
     y = M.reshape(-1)
     goal = 50 * float(jnp.finfo(dtype).eps) * (1 + jnp.sqrt(jnp.sum(y**2)))
-    rounds = ROUNDS if y.size <= NEWTON_LIMIT else 50 * ROUNDS
+    newton = y.size <= NEWTON_LIMIT
+    effort = 1 if newton else 50
     zero, lengths = jnp.zeros_like(y), jnp.asarray(LENGTHS, dtype)
 
-    def improve(carry: tuple[_Split, Array]) -> tuple[_Split, Array]:
-        split, count = carry
+    def improve(carry: tuple[_Split, Array, Array]) -> tuple[_Split, Array, Array]:
+        split, best, count = carry
         x, parts = jax.lax.fori_loop(
             0, SWEEPS, lambda _, now: _sweep(sets, now[0], now[1], shape), (split.x, split.parts)
         )
         split = _split(sets, x, parts, shape)
-        if y.size <= NEWTON_LIMIT:
+        if newton:
             linear = _Linearised(sets, split, shape)
             errors = _projections(sets, x + parts, shape) - x
             dx = linear.move(errors, zero)
             dparts = linear.parts(errors, dx, zero)
             tried = jax.vmap(lambda t: _split(sets, x + t * dx, parts + t * dparts, shape))(lengths)
-            best = jnp.nanargmin(jnp.append(tried.defect, split.defect))
-            split = jax.tree.map(lambda new, old: jnp.concatenate([new, old[None]])[best], tried, split)
-        return split, count + 1
-
-    def unsolved(carry: tuple[_Split, Array]) -> Array:
-        return (carry[0].defect > goal) & (carry[1] < rounds)
+            chosen = jax.tree.map(lambda leaf: leaf[jnp.nanargmin(tried.defect)], tried)
+            # Only for real progress on all before, so that Dykstra, which must converge, is left alone in the end.
+            better = chosen.defect < best / 2
+            split = jax.tree.map(lambda new, old: jnp.where(better, new, old), chosen, split)
+            best = jnp.where(better, chosen.defect, best)
+        return split, best, count + 1
 
     start = _split(sets, y, jnp.zeros((len(sets), y.size), dtype), shape)
     centre = jax.lax.fori_loop(0, SWEEPS, lambda _, x: _sweep(sets, x, jnp.zeros_like(start.parts), shape)[0], y)
@@ -149,28 +152,43 @@ def _solve(sets: Sets, M: Array) -> _Split:
         target = centre + now.tried * (y - centre)
         parts = now.parts * (now.tried / jnp.where(now.reached > 0, now.reached, 1))
         first = _split(sets, target - jnp.sum(parts, axis=0), parts, shape)
-        split, _ = jax.lax.while_loop(unsolved, improve, (first, jnp.asarray(0)))
-        solved = split.defect <= goal
+
+        def unsolved(carry: tuple[_Split, Array, Array]) -> Array:
+            return (carry[0].defect > goal) & (carry[2] < now.rounds)
+
+        split, _, _ = jax.lax.while_loop(unsolved, improve, (first, first.defect, jnp.asarray(0)))
+        solved = split.defect <= 100 * goal
         reached = jnp.where(solved, now.tried, now.reached)
         nearer = jnp.where(now.reached > 0, jnp.sqrt(now.reached * now.tried), now.tried / 64)
         following = jnp.where(solved, jnp.minimum(8 * now.tried, 1), nearer)
-        return _Progress(reached, jnp.where(solved, split.parts, now.parts), following, split, now.count + 1)
+        rounds = jnp.where(solved, now.rounds, jnp.minimum(2 * now.rounds, effort * MOST_ROUNDS))
+        parts = jnp.where(solved, split.parts, now.parts)
+        return _Progress(reached, parts, following, split, rounds, now.count + 1)
 
     def unfinished(now: _Progress) -> Array:
         return (now.reached < 1) & (now.count < STAGES)
 
     reached = jnp.where(start.defect > goal, 0.0, 1.0).astype(dtype)
-    first = _Progress(reached, start.parts, jnp.ones((), dtype), start, jnp.asarray(0))
+    first = _Progress(reached, start.parts, jnp.ones((), dtype), start, jnp.asarray(effort * ROUNDS), jnp.asarray(0))
     last = jax.lax.while_loop(unfinished, stage, first)
     # Where even that fails, the split of the start keeps the defect honest: it is not small.
     return jax.tree.map(lambda new, old: jnp.where(last.reached < 1, old, new), last.split, start)
 
 
+def _point(sets: Sets, M: Array, split: _Split) -> Array:
+    """The projection that a split of M tells, or NaN where it was not found.
+
+    It is polished by the last set, so that bounds hold exactly where that set is a box.
+    """
+    nearest = sets[-1].project((split.x + split.parts[-1]).reshape(M.shape))
+    accuracy = ACCURACY if M.dtype == jnp.float64 else 1e4 * ACCURACY
+    found = split.defect <= accuracy * (1 + jnp.sqrt(jnp.sum(M**2)))
+    return jnp.where(found, nearest, jnp.nan)
+
+
 @eqx.filter_custom_jvp
 def _project(sets: Sets, M: Array) -> Array:
-    """The projection, polished by the last set, so that bounds hold exactly where that set is a box."""
-    split = _solve(sets, M)
-    return sets[-1].project((split.x + split.parts[-1]).reshape(M.shape))
+    return _point(sets, M, _solve(sets, M))
 
 
 @_project.def_jvp
@@ -179,7 +197,7 @@ def _project_derivative(primals: tuple[Sets, Array], tangents: tuple[Any, Array 
     moved_sets, dM = tangents
     shape = M.shape
     split = _solve(sets, M)
-    value = sets[-1].project((split.x + split.parts[-1]).reshape(shape))
+    value = _point(sets, M, split)
     dy = jnp.zeros_like(split.x) if dM is None else dM.reshape(-1)
     rows = []
     for member, tangent, part in zip(sets, moved_sets, split.parts, strict=True):
@@ -207,9 +225,8 @@ def _support(sets: Sets, direction: Array, reach: Array) -> Array:
 class Intersection(AbstractSet):
     """The policies that lie in every one of several sets.
 
-    Projections come from Dykstra's algorithm with Newton steps, accurate to 1e-8 (usually to rounding); their
-    derivative from the fixed-point equations. For more than 512 free parameters Dykstra works alone, and carries no
-    useful derivative.
+    Projections come from Dykstra's algorithm with Newton steps, accurate to 1e-8 (usually to rounding) or NaN, which
+    solvers report; their derivative from the fixed-point equations. Above 512 free parameters Dykstra works alone.
 
     Args:
         sets: one or more feasible sets, nested intersections included.
@@ -245,14 +262,15 @@ class Intersection(AbstractSet):
         if not all(is_concrete(leaf) for leaf in leaves):
             return
         dtype = jnp.result_type(float, *[leaf.dtype for leaf in leaves if jnp.issubdtype(leaf.dtype, jnp.floating)])
-        point = self.project(jnp.zeros(shape, dtype))
+        split = _solve(self.sets, jnp.zeros(shape, dtype))
+        point = self.sets[-1].project((split.x + split.parts[-1]).reshape(shape))
         gaps = [float(jnp.linalg.norm(point - member.project(point))) for member in self.sets]
         # Sets that touch are approached slowly: call them apart only where they clearly are.
         if not max(gaps) <= math.sqrt(ACCURACY) * (1 + float(jnp.linalg.norm(point))):
             worst = type(self.sets[int(np.argmax(gaps))]).__name__
             raise fail(
                 "sets",
-                f"a nearest point that is {max(gaps):.3g} away from the {worst}",
+                f"no point, the nearest to zero of the last one being {max(gaps):.3g} away from the {worst}",
                 "have a common point: their intersection is empty",
                 "Relax one of them.",
             )

@@ -14,7 +14,8 @@ class InverseStep(eqx.Module):
     """η_n = phi1 / (n + phi2): the diminishing step of Theorem 1.
 
     Args:
-        phi1, phi2: positive numbers.
+        phi1: a positive number.
+        phi2: likewise.
     """
 
     phi1: Array

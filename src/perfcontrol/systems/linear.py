@@ -52,7 +52,8 @@ class LinearSystem(eqx.Module):
         """The decoupled system x_i ← a_i x_i + b_i u_i: products with A and B then cost O(n) everywhere.
 
         Args:
-            a, b: (n,) or (T, n).
+            a: (n,) or (T, n).
+            b: likewise.
         """
         diagonals = []
         for name, value in (("a", as_array("a", a)), ("b", as_array("b", b))):
