@@ -56,6 +56,6 @@ def on_page_content(content: str, *, page, **_) -> str:
         except ValueError as error:
             log.warning("%s: equation not understood (%s): %s", page.file.src_uri, error, latex.strip())
             return match[0]
-        return f'<{match["tag"]} class="math {display}">{mathml}</{match["tag"]}>'
+        return f'<{match["tag"]} class="equation-{display}">{mathml}</{match["tag"]}>'
 
     return EQUATION.sub(replace, content)

@@ -78,8 +78,8 @@ def check_finite(what: str, answer: Any) -> Any:
     for leaf in jax.tree.leaves(answer):
         if is_concrete(leaf) and not np.all(np.isfinite(np.asarray(leaf))):
             raise OverflowError(
-                f"{what} overflows {leaf.dtype.name} at this policy: the second moments of the state grow too fast over "
-                "the horizon. Use a policy of smaller norm, a shorter horizon, or a gain that stabilises the system."
+                f"{what} overflows {leaf.dtype.name} at this policy: the second moments of the state grow too "
+                "fast over the horizon. Use a policy of smaller norm, a shorter horizon, or a stabilising gain."
             )
     return answer
 

@@ -135,9 +135,8 @@ def certify(
     kinds = tuple(kind) if kind else ("paper", "rigorous", "global", "sharp")
     with console.status("certifying"):
         rows = verdict_rows(problem, kinds, batch=batch)
-    table = Table(
-        "certificate", "applicable", "holds", "exists", "left", "right", "rate", title=f"{name}, {order}, {growth:g}"
-    )
+    columns = ("certificate", "applicable", "holds", "exists", "left", "right", "rate")
+    table = Table(*columns, title=f"{name}, {order}, {growth:g}")
     for row in rows:
         shown = [_shown(row[key]) for key in ("applicable", "holds", "exists", "lhs", "rhs", "rate")]
         table.add_row(row["kind"], *shown)

@@ -78,6 +78,6 @@ def as_policy_map(name: str, value: Any) -> AbstractPolicyMap | Array:
 
 
 def evaluate_map(policy_map: AbstractPolicyMap | Array, M: Array) -> Array:
-    """The value of a policy map, or of a constant, at M, in the precision of M whatever the map's own constants have."""
+    """The value of a policy map, or of a constant, at M; in the precision of M."""
     value = policy_map(M) if isinstance(policy_map, AbstractPolicyMap) else policy_map
     return jnp.asarray(value).astype(M.dtype)

@@ -26,7 +26,7 @@ from perfcontrol.sets.base import AbstractSet
 SWEEPS = 20  # of Dykstra between two Newton steps
 ROUNDS = 12  # of sweeps and a Newton step in a stage, at first; doubled when a stage fails
 MOST_ROUNDS = 400
-STAGES = 40  # on the way to a point far outside, at most
+STAGES = 60  # on the way to a point far outside, at most
 LENGTHS = (1.0, 0.5, 0.25, 0.1, 0.03)  # of Newton steps
 NEWTON_LIMIT = 512  # free parameters up to which derivatives of projections are held as matrices
 ACCURACY = 1e-8  # what a projection promises, relative
@@ -107,6 +107,7 @@ class _Progress(eqx.Module):
     reached: Float[Array, ""]  # fraction of the segment; 0 before the first success
     parts: Float[Array, "k p"]  # there
     tried: Float[Array, ""]
+    growth: Float[Array, ""]  # of the fraction from stage to stage
     split: _Split  # of the last trial
     rounds: Int[Array, ""]
     count: Int[Array, ""]
@@ -159,17 +160,18 @@ def _solve(sets: Sets, M: Array) -> _Split:
         split, _, _ = jax.lax.while_loop(unsolved, improve, (first, first.defect, jnp.asarray(0)))
         solved = split.defect <= 100 * goal
         reached = jnp.where(solved, now.tried, now.reached)
-        nearer = jnp.where(now.reached > 0, jnp.sqrt(now.reached * now.tried), now.tried / 64)
-        following = jnp.where(solved, jnp.minimum(8 * now.tried, 1), nearer)
+        growth = jnp.where(solved | (now.reached == 0), now.growth, jnp.sqrt(now.growth))
+        following = jnp.where(reached > 0, jnp.minimum(growth * reached, 1), now.tried / 64)
         rounds = jnp.where(solved, now.rounds, jnp.minimum(2 * now.rounds, effort * MOST_ROUNDS))
         parts = jnp.where(solved, split.parts, now.parts)
-        return _Progress(reached, parts, following, split, rounds, now.count + 1)
+        return _Progress(reached, parts, following, growth, split, rounds, now.count + 1)
 
     def unfinished(now: _Progress) -> Array:
         return (now.reached < 1) & (now.count < STAGES)
 
     reached = jnp.where(start.defect > goal, 0.0, 1.0).astype(dtype)
-    first = _Progress(reached, start.parts, jnp.ones((), dtype), start, jnp.asarray(effort * ROUNDS), jnp.asarray(0))
+    one = jnp.ones((), dtype)
+    first = _Progress(reached, start.parts, one, 8 * one, start, jnp.asarray(effort * ROUNDS), jnp.asarray(0))
     last = jax.lax.while_loop(unfinished, stage, first)
     # Where even that fails, the split of the start keeps the defect honest: it is not small.
     return jax.tree.map(lambda new, old: jnp.where(last.reached < 1, old, new), last.split, start)
