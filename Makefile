@@ -79,7 +79,8 @@ imports: $(DEV_READY) ## Check that imports go downward only
 	$(BIN)/lint-imports --no-logo
 
 PYTEST   := $(BIN)/python -m pytest
-CHECKED  := -n $(WORKERS) --jaxtyping-packages=perfcontrol,beartype.beartype
+# One file, one worker: what a file compiles is compiled once.
+CHECKED  := -n $(WORKERS) --dist loadfile --jaxtyping-packages=perfcontrol,beartype.beartype
 FLOAT64  := JAX_ENABLE_X64=1 PERFCONTROL_TEST_X64=1
 FLOAT32  := JAX_ENABLE_X64=0 PERFCONTROL_TEST_X64=0
 
@@ -97,7 +98,7 @@ pytest32: $(DEV_READY) ## Run the tests marked float32 in single precision
 
 .PHONY: slow
 slow: $(DEV_READY) ## Run the tests marked slow
-	$(FLOAT64) $(PYTEST) $(CHECKED) -m slow $(PYTEST_ARGS)
+	PERFCONTROL_TEST_OPTIMISED=1 $(FLOAT64) $(PYTEST) $(CHECKED) -m slow $(PYTEST_ARGS)
 
 .PHONY: docs
 docs: $(DEV_READY) ## Build the documentation into site/, warnings being errors

@@ -36,6 +36,15 @@ def growing(M):
     return 1 + jnp.sum(M**2)[None]
 
 
+def test_convex_cost_is_its_function_at_every_stage():
+    cost, x, u = Soft(jnp.asarray(1.5)), normal(8, 5, 3), normal(9, 5, 2)
+    expected = [cost(t, x[t], u[t]) for t in range(5)]
+    assert_close(pc.ConvexCost(cost).path_cost(x, u), expected)
+    slopes = [jax.grad(cost, argnums=(1, 2))(t, x[t], u[t]) for t in range(5)]
+    for i, values in enumerate(pc.ConvexCost(cost).path_gradients(x, u)):
+        assert_close(values, [slope[i] for slope in slopes])
+
+
 def problem(cost):
     return pc.PerformativeProblem(
         system=pc.LinearSystem(0.4 * normal(1, 3, 3), normal(2, 3, 2)),

@@ -51,6 +51,21 @@ def enumerated() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return deployed, linear, np.stack([gradient(unit) - linear for unit in np.eye(8)], axis=1)
 
 
+@pytest.mark.parametrize("scale", [1.0, 1e6])
+def test_best_response_on_an_affine_set_of_one_point_is_that_point(scale):
+    """Nothing is left to choose: what rounding leaves of the Hessian must not be inverted."""
+    single = pc.PerformativeProblem(
+        system=pc.LinearSystem(A, B),
+        horizon=6,
+        memory=2,
+        noise=pc.Rademacher([1.0, 0.5], mean=[0.2, 0.0]),
+        cost=pc.QuadraticCost(scale * np.eye(2), 0.5 * scale * np.eye(2)),
+        feasible_set=pc.RowSum(0.2),
+        structure=pc.RepeatedBlock(2),
+    )
+    assert_close(pc.best_response(single, np.full((2, 1, 1), 0.2)), np.full((2, 1, 1), 0.2))
+
+
 CASES = {
     "frobenius ball": (lambda: pc.FrobeniusBall(0.5), lambda M: [cp.norm(cp.hstack(M), "fro") <= 0.5]),
     "spectral ball": (lambda: pc.SpectralBall(0.4), lambda M: [cp.sigma_max(cp.hstack(M)) <= 0.4]),

@@ -78,6 +78,24 @@ def test_bound_of_rademacher_entries_is_attained_by_equal_signs():
     assert_close(pc.DensePerturbation(0.5, law="rademacher").bound(lifted, 2), np.full(2, 0.5 * 3))
 
 
+@pytest.mark.parametrize("law", ["sphere", pc.Constant([1.0, -1.0, 1.0])], ids=["sphere", "vector"])
+def test_sensitivity_of_one_row_is_the_wasserstein_distance(law):
+    """A 1 x 3 matrix of constant norm √3 times a positive scale: W₁ = √3 |scale - scale'|, largest along the slope."""
+    slope = normal(9, 1, 1, 2, 1)
+    perturbation = pc.DensePerturbation(pc.Affine([9.0], slope), law=law, on_input=True)
+    lifted = LiftedSet(pc.FrobeniusBall(1.0), pc.FullStructure(), (1, 2, 1))
+    assert_close(perturbation.sensitivity(lifted, 1), [np.sqrt(3) * np.linalg.norm(slope)])
+
+
+def test_sensitivity_of_the_mean_is_its_largest_slope():
+    """Nothing is random: W₁ = ‖mean - mean'‖; here one entry moves by one policy entry, another by another, less."""
+    slope = np.zeros((3, 3, 2, 2, 3))
+    slope[0, 0, 0, 0, 0], slope[1, 2, 1, 1, 2] = 0.7, 0.3
+    law = pc.DensePerturbation(0.0, pc.Affine(np.zeros((3, 3)), slope))
+    lifted = LiftedSet(pc.FrobeniusBall(1.0), pc.FullStructure(), (2, 2, 3))
+    assert_close(law.sensitivity(lifted, 2), [0.7, 0.7])
+
+
 def test_sphere_draws_have_the_radius_they_claim():
     law = pc.DensePerturbation(0.5, law="sphere", on_input=True)
     matrices = law.sample(jax.random.key(0), normal(1, 2, 2, 3), 4).dense()

@@ -177,10 +177,10 @@ def natural_residual(problem: PerformativeProblem, world: CostToGo, M: Array, st
 # --- methods: each minimises one quadratic over its kind of set, and gives Newton steps at a minimiser ---------------
 
 
-def _pseudo_inverse(matrix: Array) -> tuple[Array, Array]:
-    """matrix⁺ of a PSD matrix, and its numerical rank."""
+def _pseudo_inverse(matrix: Array, scale: Array) -> tuple[Array, Array]:
+    """matrix⁺ of a PSD matrix, and its numerical rank; eigenvalues that are rounding beside `scale` count as zero."""
     values, vectors = jnp.linalg.eigh(matrix)
-    threshold = jnp.max(jnp.abs(values)) * matrix.shape[0] * jnp.finfo(matrix.dtype).eps
+    threshold = scale * matrix.shape[0] * jnp.finfo(matrix.dtype).eps
     kept = values > threshold
     inverse = jnp.where(kept, 1 / jnp.where(kept, values, 1), 0)
     return (vectors * inverse) @ vectors.T, jnp.sum(kept)
@@ -202,11 +202,12 @@ class _Affine:
             self.solve = self._conjugate_gradients(tangent)
             return
         if isinstance(problem.feasible_set, Unconstrained):
-            inverse, rank = _pseudo_inverse(form.matrix)
+            inverse, rank = _pseudo_inverse(form.matrix, 1 / form.step)
             dimension = jnp.asarray(size)
         else:
             P = jax.vmap(lambda row: tangent(row.reshape(shape)).reshape(-1))(jnp.eye(size, dtype=dtype))
-            inverse, rank = _pseudo_inverse(symmetrise(P @ form.matrix @ P))
+            # By the size of the whole Hessian: on a set of one point what is left of it is rounding alone.
+            inverse, rank = _pseudo_inverse(symmetrise(P @ form.matrix @ P), 1 / form.step)
             inverse = P @ inverse @ P
             dimension = jnp.round(jnp.trace(P))
         self.unique = rank >= dimension
@@ -225,7 +226,7 @@ class _Affine:
         def solve(gradient: Array) -> Array:
             right = -tangent(tangent(gradient))
             # What rounding leaves of a gradient need not be in the range of the Hessian: never chase it.
-            rounding = tolerance * (_norm(gradient) + _norm(form.linear))
+            rounding: Any = tolerance * (_norm(gradient) + _norm(form.linear))
             found = jax.scipy.sparse.linalg.cg(hessian, right, tol=tolerance, atol=rounding, maxiter=10 * right.size)[0]
             return tangent(found)
 

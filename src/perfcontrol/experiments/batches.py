@@ -48,7 +48,8 @@ def map_over_devices(function: Callable[..., Any], batch: int = BATCH) -> Callab
         count = jax.tree.leaves(arguments)[0].shape[0]
         short = -count % len(devices)
 
-        def pad(leaf: Array) -> Array:
+        def pad(leaf: Any) -> Array:
+            leaf = jnp.asarray(leaf)
             return jnp.concatenate([leaf, jnp.repeat(leaf[-1:], short, axis=0)]) if short else leaf
 
         return jax.tree.map(lambda leaf: leaf[:count], compiled(jax.tree.map(pad, arguments)))

@@ -78,7 +78,7 @@ def figure_error(runs: xarray.Dataset, path: Path) -> list[Path]:
         _log_axes(axes)
         axes.set_title(REGIME_TITLES[regime])
         axes.set_xlabel("iteration $n$")
-        _guide(axes, steps[-1] / 30, steps[-1], lowest / 3)
+        _guide(axes, float(steps[-1]) / 30, float(steps[-1]), lowest / 3)
     panels[0].set_ylim(float(runs["error"].min()) / 5, CEILING * first)
     panels[0].set_ylabel(r"$\|M_n - M^{\mathrm{PS}}\|_F^2$")
     _orders_legend(figure, panels[0])
@@ -118,7 +118,7 @@ def figure_cure(cure: xarray.Dataset, sweep: xarray.Dataset, settings: Reproduce
     for order in ORDER_COLOURS:
         band(left, steps, *_quantiles(cure["diminishing"].sel(order=order).values), order)
     _log_axes(left)
-    _guide(left, steps[-1] / 30, steps[-1], float(cure["diminishing"].median("seed").min()) / 2)
+    _guide(left, float(steps[-1]) / 30, float(steps[-1]), float(cure["diminishing"].median("seed").min()) / 2)
     left.set_title(rf"diminishing step ${settings.step_size:g}\cdot 10/(n+10)$")
     left.set_ylabel(r"$\|M_n - M^{\mathrm{PS}}\|_F^2$")
 

@@ -114,8 +114,8 @@ class _Progress(eqx.Module):
 
 
 @eqx.filter_jit
-def _solve(sets: Sets, M: Array) -> _Split:
-    """The projection of M as a `_Split`.
+def _solve(sets: Sets, M: Array, newton: bool = True) -> _Split:
+    """The projection of M as a `_Split`; `newton=False` leaves Dykstra alone.
 
     A point far outside, in units of the sets, is approached in stages along the segment from a nearly feasible point:
     the parts grow in proportion, so that each stage starts close to its solution.
@@ -123,7 +123,7 @@ def _solve(sets: Sets, M: Array) -> _Split:
     shape, dtype = M.shape, M.dtype
     y = M.reshape(-1)
     goal = 50 * float(jnp.finfo(dtype).eps) * (1 + jnp.sqrt(jnp.sum(y**2)))
-    newton = y.size <= NEWTON_LIMIT
+    newton = newton and y.size <= NEWTON_LIMIT
     effort = 1 if newton else 50
     zero, lengths = jnp.zeros_like(y), jnp.asarray(LENGTHS, dtype)
 
@@ -221,7 +221,8 @@ def _support(sets: Sets, direction: Array, reach: Array) -> Array:
     before = _project(sets, length * unit)
     after = _project(sets, before + length * unit)
     gap = jnp.sqrt(jnp.sum((after - before) ** 2)) * 2 * reach / jnp.where(length > 0, length, 1)
-    return norm * (jnp.sum(unit * after) + gap)
+    rounding = 50 * float(jnp.finfo(direction.dtype).eps) * (length + reach)  # what projections of that length leave
+    return norm * (jnp.sum(unit * after) + gap + rounding)
 
 
 class Intersection(AbstractSet):
@@ -287,7 +288,7 @@ class Intersection(AbstractSet):
         return jnp.all(jnp.stack([member.contains(M, tolerance) for member in self.sets]))
 
     def support(self, direction: Array) -> Array | None:
-        """Proved upper bound, exact to about 1e-9 relative to the radius; None where no radius is known."""
+        """Proved upper bound, exact to about 1e-8 relative to the radius; None where no radius is known."""
         shape = direction.shape[-3:]
         reach = self.radius(shape)
         if reach is None:
