@@ -199,7 +199,7 @@ def test_rsgd_approaches_the_stable_policy_when_the_step_diminishes_in_the_unsta
 def test_nothing_depends_on_the_policy_when_the_volatility_is_as_printed():
     problem = stock_market(volatility="as_printed")
     one, two = (problem.feasible_set.project(jax.random.normal(jax.random.key(k), (1, 10, 10))) for k in (1, 2))
-    variance = np.asarray(problem.perturbation.second_moment - problem.perturbation.first_moment**2)
+    variance = np.asarray(problem.perturbation.variance)
     assert np.abs(variance).max() < 1e-12
     means = [problem.perturbation.mean(problem.lift(M), 60) for M in (one, two)]
     assert_close(means[0], means[1], 1e-12)

@@ -3,6 +3,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.optimize
 
 import perfcontrol as pc
 from perfcontrol.sets import intersection
@@ -81,13 +82,21 @@ def test_intersection_projection_satisfies_its_variational_inequality_far_outsid
         assert float(jnp.max(gaps)) <= 1e-8 * scale
 
 
-def test_dykstra_alone_finds_the_same_point():
-    """As above the size limit for Newton steps; the nearest point is not the one that plain sweeps would reach."""
+def test_dykstra_alone_matches_the_one_threshold_of_each_row():
+    """As above the size limit for Newton steps. Rows in a box with a given sum: clip(y - threshold), by bisection."""
     feasible_set = pc.Intersection([pc.RowSum(0.5), pc.Box(-0.1, 0.4)])
     for seed in (3, 4, 5):
-        M = 2 * normal(seed, 1, 2, 3)
-        alone = intersection._solve(feasible_set.sets, M, newton=False)
-        assert_close(alone.x.reshape(M.shape), feasible_set.project(M), 1e-8)
+        M = np.asarray(2 * normal(seed, 1, 2, 3))
+        expected = np.zeros_like(M)
+        for index in np.ndindex(1, 2):
+            row = M[index]
+            threshold = scipy.optimize.brentq(
+                lambda t, row=row: np.clip(row - t, -0.1, 0.4).sum() - 0.5, row.min() - 1, row.max() + 1, xtol=1e-15
+            )
+            expected[index] = np.clip(row - threshold, -0.1, 0.4)
+        alone = intersection._solve(feasible_set.sets, jnp.asarray(M), newton=False)
+        assert_close(alone.x.reshape(M.shape), expected, 1e-8)
+        assert_close(feasible_set.project(jnp.asarray(M)), expected, 1e-12)
 
 
 def test_intersection_projection_differentiates_in_the_parameters_of_its_sets():

@@ -311,7 +311,7 @@ def as_printed_stage(settings: ReproduceSettings) -> dict[str, float]:
     """The volatility as printed: how much of anything still depends on the policy."""
     problem = _problems(settings, "rows", "as_printed")[0]
     perturbation = problem.perturbation
-    variance = np.asarray(perturbation.second_moment - perturbation.first_moment**2)  # type: ignore[attr-defined]
+    variance = np.asarray(perturbation.variance)  # type: ignore[attr-defined]
     first = _starts(stack_problems([problem]), settings, 2)
     far = [solve(problem, RRM(), start, throw=False) for start in first]
     return {

@@ -125,7 +125,7 @@ class StockPerturbation(AbstractPerturbation):
     rate: Array
     exposure: Array
     first_moment: Array
-    second_moment: Array
+    variance: Array  # held apart from the moments: in float32 their difference would be mostly rounding
     volatility: str = eqx.field(static=True)
 
     def __init__(self, sensitivities: Any, rate: Any, exposure: Any, volatility: str = "lognormal"):
@@ -141,7 +141,7 @@ class StockPerturbation(AbstractPerturbation):
         self.volatility = volatility
         first, second = growth_moments(np.log(np.asarray(sensitivities, dtype=float)), float(self.rate), volatility)
         self.first_moment = jnp.asarray(first, sensitivities.dtype)
-        self.second_moment = jnp.asarray(second, sensitivities.dtype)
+        self.variance = jnp.asarray(second - first**2, sensitivities.dtype)
 
     def check(self, policy_shape: tuple[int, int, int], horizon: int) -> None:
         _, m, n = policy_shape
@@ -173,7 +173,7 @@ class StockPerturbation(AbstractPerturbation):
 
     def covariance(self, M: Array, horizon: int) -> CovarianceOperator:
         portfolio = self.portfolio(M)
-        return _StockCovariance(self.second_moment - self.first_moment**2, portfolio @ portfolio.T)
+        return _StockCovariance(self.variance, portfolio @ portfolio.T)
 
     def bound(self, feasible_set: Any, horizon: int) -> Array | None:
         """Known on a bounded set: per stock the 2 x 2 block has Frobenius norm √(a² + b² + (a+b)²)."""
@@ -193,7 +193,7 @@ class StockPerturbation(AbstractPerturbation):
 
     def sensitivity(self, feasible_set: Any, horizon: int) -> Array:
         """√(2 Var e) / exposure where the set fixes the row sums, else with L (E e)² added under the root."""
-        variance = self.second_moment - self.first_moment**2
+        variance = self.variance
         if not self._fixes_rows(feasible_set):
             variance = variance + feasible_set.policy_size / 2 * self.first_moment**2
         return jnp.sqrt(2 * variance) / self.exposure
