@@ -54,7 +54,7 @@ def test_two_unbounded_sets_that_make_a_simplex_project_and_support_like_it():
     written, simplex = pc.Intersection([pc.RowSum(1.0), pc.Box(0.0, np.inf)]), pc.RowSimplex(1.0)
     points = jnp.concatenate([scale * normal(8, 3, 2, 2, 3) for scale in (0.1, 1.0, 10.0)])
     assert_close(jax.vmap(written.project)(points), jax.vmap(simplex.project)(points), 1e-12, 1e-4)
-    assert_close(written.support(points), simplex.support(points), 1e-8, 1e-3)
+    assert_close(written.support(points), simplex.support(points), 1e-8, 1e-2)
     assert_close(written.radius((2, 2, 3)), simplex.radius((2, 2, 3)))
 
 

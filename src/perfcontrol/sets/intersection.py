@@ -68,7 +68,7 @@ class _Linearised:
     """
 
     def __init__(self, sets: Sets, split: _Split, shape: tuple[int, ...]):
-        eps = float(jnp.finfo(split.x.dtype).eps)
+        negligible = float(jnp.finfo(split.x.dtype).eps) ** 0.75
         eye = jnp.eye(split.x.size, dtype=split.x.dtype)
         slopes = []
         for member, part in zip(sets, split.parts, strict=True):
@@ -78,11 +78,11 @@ class _Linearised:
 
             slopes.append(jax.jacfwd(flat)(split.x + part))
         values, vectors = jnp.linalg.eigh(symmetrise(jnp.stack(slopes)))
-        kept = (values > 1e3 * eps)[:, None, :]
+        kept = (values > negligible)[:, None, :]
         self.inverses = (vectors * jnp.where(kept, 1 / jnp.where(kept, values[:, None, :], 1), 0)) @ transpose(vectors)
         self.normals = (vectors * ~kept) @ transpose(vectors)
         values, vectors = jnp.linalg.eigh(jnp.sum(self.normals, axis=0))
-        fixed = values > 1e4 * eps
+        fixed = values > 10 * negligible
         self.held = (vectors * jnp.where(fixed, 1 / jnp.where(fixed, values, 1), 0)) @ vectors.T
         self.free = (vectors * ~fixed) @ vectors.T
         self.metric = eye + jnp.sum(self.inverses + self.normals - eye, axis=0)
@@ -123,6 +123,7 @@ def _solve(sets: Sets, M: Array, newton: bool = True) -> _Split:
     shape, dtype = M.shape, M.dtype
     y = M.reshape(-1)
     goal = 50 * float(jnp.finfo(dtype).eps) * (1 + jnp.sqrt(jnp.sum(y**2)))
+    enough = goal * (100 if dtype == jnp.float64 else 2)
     newton = newton and y.size <= NEWTON_LIMIT
     effort = 1 if newton else 50
     zero, lengths = jnp.zeros_like(y), jnp.asarray(LENGTHS, dtype)
@@ -158,7 +159,7 @@ def _solve(sets: Sets, M: Array, newton: bool = True) -> _Split:
             return (carry[0].defect > goal) & (carry[2] < now.rounds)
 
         split, _, _ = jax.lax.while_loop(unsolved, improve, (first, first.defect, jnp.asarray(0)))
-        solved = split.defect <= 100 * goal
+        solved = split.defect <= enough
         reached = jnp.where(solved, now.tried, now.reached)
         growth = jnp.where(solved | (now.reached == 0), now.growth, jnp.sqrt(now.growth))
         following = jnp.where(reached > 0, jnp.minimum(growth * reached, 1), now.tried / 64)
@@ -217,7 +218,7 @@ def _support(sets: Sets, direction: Array, reach: Array) -> Array:
     """sup <direction, M> by two proximal steps from 0: x' = P(x + t d) leaves a gap of at most ‖x' - x‖ 2R/t."""
     norm = jnp.sqrt(jnp.sum(direction**2))
     unit = direction / jnp.where(norm > 0, norm, 1)
-    length = (1e5 if direction.dtype == jnp.float64 else 1e3) * reach
+    length = (1e5 if direction.dtype == jnp.float64 else 1e2) * reach
     before = _project(sets, length * unit)
     after = _project(sets, before + length * unit)
     gap = jnp.sqrt(jnp.sum((after - before) ** 2)) * 2 * reach / jnp.where(length > 0, length, 1)
