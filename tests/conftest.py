@@ -1,6 +1,7 @@
 """How the tests run: precision, compilation, and which of them wait for `make check`."""
 
 import os
+from collections.abc import Iterator
 
 import jax
 import pytest
@@ -23,6 +24,13 @@ SLOW = (
     "test_properties.py::test_single_precision_answers_like_double_precision",
     "test_stock.py::test_stable_policy_is_where_repeated_minimisation_goes_in_all_nine_cases[simplex]",
 )
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _programs_of_one_file_only() -> Iterator[None]:
+    """Drop compiled programs after each file: thousands in one process exhaust its memory maps, and XLA crashes."""
+    yield
+    jax.clear_caches()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
