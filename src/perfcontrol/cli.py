@@ -1,5 +1,6 @@
 """The command line. It alone sets JAX's global configuration: float64, and one host device per core."""
 
+import contextlib
 import os
 import time
 from pathlib import Path
@@ -27,7 +28,8 @@ def _configure_jax() -> None:
     jax.config.update("jax_enable_x64", True)
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     if "XLA_FLAGS" not in os.environ:
-        jax.config.update("jax_num_cpu_devices", cores)
+        with contextlib.suppress(RuntimeError):  # JAX runs already, called from a program of its own: keep its devices
+            jax.config.update("jax_num_cpu_devices", cores)
 
 
 @app.command()
