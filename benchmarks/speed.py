@@ -19,6 +19,7 @@ from perfcontrol.evaluate.adjoint import mean_path_gradient, path_gradient
 from perfcontrol.evaluate.exact import cost_and_gradient, cost_to_go, exact_cost
 from perfcontrol.evaluate.moments import cost_by_moments
 from perfcontrol.evaluate.rollout import sample_path
+from perfcontrol.experiments.batches import in_single_precision
 
 SHAPES = {"(20, 1, 60)": (20, 1, 60), "(4, 10, 200)": (4, 10, 200), "(100, 5, 100)": (100, 5, 100)}  # n = m, H, T
 SEEDS = 288
@@ -66,11 +67,6 @@ def compiled(function: Callable, *arguments: Any) -> tuple[Callable[[], Any], fl
     return lambda: program(dynamic), time.perf_counter() - began
 
 
-def single(problem: Any) -> Any:
-    """In float32."""
-    return jax.tree.map(lambda leaf: leaf.astype(jnp.float32) if eqx.is_inexact_array(leaf) else leaf, problem)
-
-
 def _policy(problem: pc.PerformativeProblem) -> jax.Array:
     raw = 0.05 * jax.random.normal(jax.random.key(0), problem.policy_shape, problem.dtype)
     return problem.feasible_set.project(raw)
@@ -104,7 +100,7 @@ def gradient_rows(name: str, problem: pc.PerformativeProblem) -> list[Row]:
         (name, "(a) printed formula, NumPy", printed, "1"),
         (name, "(b) adjoint, NumPy", adjoint, f"{printed / adjoint:.1f}"),
     ]
-    for label, p in (("float64", problem), ("float32", single(problem))):
+    for label, p in (("float64", problem), ("float32", in_single_precision(problem))):
         policy = M.astype(p.dtype)
         path = sample_path(p, p.lift(policy), p.lift(policy), jax.random.key(1))
         call, build = compiled(path_gradient, p, path)
@@ -229,7 +225,7 @@ def table(quick: bool) -> str:
         t for case, what, t, _ in rows if case == "dense (20, 1, 60)" and "per seed" in what and "float32" in what
     )
     printed = next(t for case, what, t, _ in rows if case == "dense (20, 1, 60)" and "(a)" in what)
-    for label, p in (("float64", stock), ("float32", single(stock))):
+    for label, p in (("float64", stock), ("float32", in_single_precision(stock))):
         call, build = compiled(batch_gradients, p, M.astype(p.dtype), jax.random.split(jax.random.key(3), SEEDS))
         took = median_time(call) / SEEDS
         rows.append(

@@ -138,6 +138,15 @@ def check_symmetric_psd(name: str, array: Array, remedy: str) -> None:
         raise fail(name, f"smallest eigenvalue {smallest:.3g}", "be positive semidefinite", remedy)
 
 
+def as_radius(value: Any) -> Array:
+    """The radius of a ball: one nonnegative number."""
+    radius = as_array("radius", value)
+    check_shape("radius", radius, (), (), "Pass one number.")
+    if is_concrete(radius) and float(radius) < 0:
+        raise fail("radius", f"{float(radius)}", "be nonnegative: the set is empty", "Pass a radius ≥ 0.")
+    return radius
+
+
 def check_integer(name: str, value: Any, minimum: int) -> int:
     """`value` as a Python int of at least `minimum`."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):

@@ -24,6 +24,11 @@ def transpose(matrix: Any) -> Any:
     return jnp.swapaxes(matrix, -1, -2)
 
 
+def frobenius(M: Array) -> Array:
+    """‖M‖_F over all axes."""
+    return jnp.sqrt(jnp.sum(M**2))
+
+
 def symmetrise(matrix: Array) -> Array:
     """Symmetric part over the last two axes."""
     return (matrix + transpose(matrix)) / 2

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from perfcontrol._checks import check_finite
-from perfcontrol._linalg import symmetrise
+from perfcontrol._linalg import frobenius, symmetrise
 from perfcontrol.evaluate.exact import (
     CostToGo,
     cost_and_gradient,
@@ -160,15 +160,11 @@ def _power_iteration(gradient: Operator, linear: Array) -> Array:
     return jnp.maximum(1.2 * norm, tiny)
 
 
-def _norm(M: Array) -> Array:
-    return jnp.sqrt(jnp.sum(M**2))
-
-
 def natural_residual(problem: PerformativeProblem, world: CostToGo, M: Array, step: Array) -> Array:
     """‖M - Proj(M - η g)‖_F relative to ‖M‖_F + η ‖g(0)‖_F, η = 1/‖Hessian‖; g by a pass over time of its own."""
     at_zero, at_M = jax.vmap(_gradient_at(problem, world))(jnp.stack([jnp.zeros_like(M), M]))
-    moved = _norm(M - problem.feasible_set.project(M - step * at_M))
-    scale = _norm(M) + step * _norm(at_zero)
+    moved = frobenius(M - problem.feasible_set.project(M - step * at_M))
+    scale = frobenius(M) + step * frobenius(at_zero)
     relative = moved / jnp.where(scale > 0, scale, 1)
     # A world that overflows has a zero step, and would pass for stable.
     return jnp.where(jnp.all(jnp.isfinite(at_M)) & (step > 0), relative, jnp.inf)
@@ -226,7 +222,7 @@ class _Affine:
         def solve(gradient: Array) -> Array:
             right = -tangent(tangent(gradient))
             # What rounding leaves of a gradient need not be in the range of the Hessian: never chase it.
-            rounding: Any = tolerance * (_norm(gradient) + _norm(form.linear))
+            rounding: Any = tolerance * (frobenius(gradient) + frobenius(form.linear))
             found = jax.scipy.sparse.linalg.cg(hessian, right, tol=tolerance, atol=rounding, maxiter=10 * right.size)[0]
             return tangent(found)
 
@@ -276,7 +272,7 @@ class _Projected:
             right = self.residual(M).reshape(-1)
             newton = self.project(M - jnp.linalg.solve(slope + eps * self.eye, right).reshape(M.shape))
             candidates = jnp.stack([newton, fallback])
-            gaps = jax.vmap(lambda candidate: _norm(self.residual(candidate)))(candidates)
+            gaps = jax.vmap(lambda candidate: frobenius(self.residual(candidate)))(candidates)
             best = jnp.where(gaps[0] <= gaps[1], 0, 1)  # the fallback where Newton is not finite
             improved = gaps[best] < gap
             return (
@@ -291,14 +287,14 @@ class _Projected:
             M, gap, count, stuck, _ = carry
             return (count == 0) | ((gap > 4 * eps * self._scale(M)) & (count < NEWTON_STEPS) & ~stuck)
 
-        first = (M, _norm(self.residual(M)), jnp.asarray(0), jnp.asarray(False), self.eye)
+        first = (M, frobenius(self.residual(M)), jnp.asarray(0), jnp.asarray(False), self.eye)
         M, *_, slope = jax.lax.while_loop(unsolved, improve, first)
         # On the active face the Hessian must be definite: the Jacobian has full rank.
         values = jnp.linalg.eigvalsh(slope @ slope.T)
         return M, values[0] > (M.size * eps * 100) ** 2 * jnp.maximum(values[-1], 1)
 
     def _scale(self, M: Array) -> Array:
-        return _norm(M) + self.step * _norm(self.form.linear) + jnp.finfo(M.dtype).tiny
+        return frobenius(M) + self.step * frobenius(self.form.linear) + jnp.finfo(M.dtype).tiny
 
     def _accelerated(self, start: Array, tolerance: float, limit: int) -> Array:
         """Projected gradient steps with momentum, restarted when it points uphill."""
@@ -309,7 +305,7 @@ class _Projected:
             grown = (1 + jnp.sqrt(1 + 4 * momentum**2)) / 2
             uphill = jnp.sum((ahead - following) * (following - M)) > 0
             ahead_next = following + jnp.where(uphill, 0, (momentum - 1) / grown) * (following - M)
-            return following, ahead_next, jnp.where(uphill, 1, grown), count + 1, _norm(following - ahead)
+            return following, ahead_next, jnp.where(uphill, 1, grown), count + 1, frobenius(following - ahead)
 
         def unfinished(carry: Any) -> Array:
             M, _, _, count, moved = carry

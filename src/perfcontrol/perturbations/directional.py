@@ -38,7 +38,9 @@ class _DirectionalDraws(Draws):
         return matrices if self.mean is None else matrices + self.mean
 
 
-class _DirectionalCovariance(CovarianceOperator):
+class DirectionalCovariance(CovarianceOperator):
+    """Σ_k variances[t, k] D_k X D_kᵀ and its adjoint."""
+
     variances: Array  # (T, k)
     directions: Array  # (k, n, p)
 
@@ -125,7 +127,7 @@ class DirectionalPerturbation(AbstractPerturbation):
         return None if self.mean_map is None else self.mean(M, horizon)
 
     def covariance(self, M: Array, horizon: int) -> CovarianceOperator:
-        return _DirectionalCovariance(self.scales(M, horizon) ** 2, self.directions)
+        return DirectionalCovariance(self.scales(M, horizon) ** 2, self.directions)
 
     def policy_free_mean(self) -> bool:
         return not isinstance(self.mean_map, AbstractPolicyMap)

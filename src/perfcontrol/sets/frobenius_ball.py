@@ -5,7 +5,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from perfcontrol._checks import as_array, check_shape, fail, is_concrete
+from perfcontrol._checks import as_radius
 from perfcontrol.sets.base import AbstractSet
 
 
@@ -19,10 +19,7 @@ class FrobeniusBall(AbstractSet):
     limit: Array
 
     def __init__(self, radius: Any):
-        self.limit = as_array("radius", radius)
-        check_shape("radius", self.limit, (), (), "Pass one number.")
-        if is_concrete(self.limit) and float(self.limit) < 0:
-            raise fail("radius", f"{float(self.limit)}", "be nonnegative: the set is empty", "Pass a radius ≥ 0.")
+        self.limit = as_radius(radius)
 
     def project(self, M: Array) -> Array:
         # The inner where keeps the derivative finite at M = 0.

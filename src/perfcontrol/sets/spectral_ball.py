@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from perfcontrol._checks import as_array, check_shape, fail, is_concrete
+from perfcontrol._checks import as_radius
 from perfcontrol._linalg import transpose
 from perfcontrol.sets.base import AbstractSet
 
@@ -66,10 +66,7 @@ class SpectralBall(AbstractSet):
     limit: Array
 
     def __init__(self, radius: Any):
-        self.limit = as_array("radius", radius)
-        check_shape("radius", self.limit, (), (), "Pass one number.")
-        if is_concrete(self.limit) and float(self.limit) < 0:
-            raise fail("radius", f"{float(self.limit)}", "be nonnegative: the set is empty", "Pass a radius ≥ 0.")
+        self.limit = as_radius(radius)
 
     def project(self, M: Array) -> Array:
         """Singular values of the stacked matrix above the radius are set to it."""

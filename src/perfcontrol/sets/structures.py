@@ -4,7 +4,6 @@ import abc
 import math
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
@@ -81,10 +80,3 @@ class RepeatedBlock(AbstractStructure):
     @property
     def norm(self) -> float:
         return math.sqrt(self.count)
-
-
-def lifted(structure: AbstractStructure, parameters: Array) -> Array:
-    """`structure.lift` over any leading axes."""
-    flat = parameters.reshape(-1, *parameters.shape[-3:])
-    full = jax.vmap(structure.lift)(flat)
-    return full.reshape(*parameters.shape[:-3], *full.shape[1:])

@@ -5,16 +5,12 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from perfcontrol._checks import check_integer, check_tolerance
+from perfcontrol._linalg import frobenius
 from perfcontrol.evaluate.best_response import respond
 from perfcontrol.evaluate.exact import require_moments
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.solvers.loop import AbstractSolver, State, start
 from perfcontrol.solvers.result import Result
-
-
-def frobenius(M: Array) -> Array:
-    """‖M‖_F."""
-    return jnp.sqrt(jnp.sum(M**2))
 
 
 class _Own(eqx.Module):

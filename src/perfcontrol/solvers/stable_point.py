@@ -13,12 +13,12 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from perfcontrol._checks import check_integer, check_tolerance
+from perfcontrol._linalg import frobenius
 from perfcontrol.evaluate.best_response import Response, respond, response_pushforward
 from perfcontrol.evaluate.exact import require_moments
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.solvers.loop import AbstractSolver, State, start
 from perfcontrol.solvers.result import Result
-from perfcontrol.solvers.rrm import frobenius
 
 CONTRACTING = 0.1  # repeated minimisation goes on while each step shrinks the gap at least tenfold
 HALVINGS = 6

@@ -27,27 +27,13 @@ from perfcontrol.costs import QuadraticCost
 from perfcontrol.evaluate.best_response import respond
 from perfcontrol.evaluate.exact import exact_cost, exact_gradient
 from perfcontrol.perturbations import AbstractPerturbation, CovarianceOperator, DirectionalPerturbation, Draws
+from perfcontrol.perturbations.directional import DirectionalCovariance
 from perfcontrol.policy_maps import AbstractPolicyMap, Affine
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.random_vectors import Constant
 from perfcontrol.theory.certificate import Assumption, Certificate, not_applicable
 from perfcontrol.theory.existence import constant_mean, existence
 from perfcontrol.theory.local import DENSE_LIMIT, fixed_noise, tangent_basis
-
-
-class _VarianceOperator(CovarianceOperator):
-    variances: Array  # (T, k)
-    directions: Array  # (k, n, p)
-
-    @property
-    def steps(self) -> Any:
-        return self.variances
-
-    def apply_step(self, step: Any, X: Array) -> Array:
-        return jnp.einsum("k,kab,bc,kdc->ad", step, self.directions, X, self.directions, optimize="optimal")
-
-    def adjoint_step(self, step: Any, X: Array) -> Array:
-        return jnp.einsum("k,kba,bc,kcd->ad", step, self.directions, X, self.directions, optimize="optimal")
 
 
 class _GivenVariances(AbstractPerturbation):
@@ -67,7 +53,7 @@ class _GivenVariances(AbstractPerturbation):
         return self.mean_value
 
     def covariance(self, M: Array, horizon: int) -> CovarianceOperator:
-        return _VarianceOperator(self.variances, self.directions)
+        return DirectionalCovariance(self.variances, self.directions)
 
     def bound(self, feasible_set: Any, horizon: int) -> None:
         return None
