@@ -23,15 +23,16 @@ class ReproduceSettings(BaseModel):
     initial_investment: float = Field(default=150.0, gt=0, description="q_1 of every stock")
     rate: float = Field(default=0.05, description="riskless rate over the horizon")
     trading_hours: float = Field(default=6.5, gt=0, lt=24, description="h, trading hours a day")
-    cure_seeds: int = Field(default=16, ge=2, description="runs of each case that show what cures divergence")
+    cure_seeds: int = Field(default=10, ge=2, description="runs of each case that show what cures divergence")
     cure_steps: int = Field(default=3000, ge=100, description="iterations of those with a diminishing step")
     sweep_seeds: int = Field(
         default=8, ge=2, description="runs per step size in the search for where divergence begins"
     )
     sweep_steps: int = Field(default=400, ge=50, description="iterations of each of those")
+    simplex: bool = Field(default=True, description="the bounded set as well: its stable points, and as a cure")
     seed: int = Field(default=0, ge=0, description="root of all randomness")
 
     @classmethod
     def quick(cls) -> "ReproduceSettings":
         """Small enough to end within seconds; the verdicts are then computed from little data."""
-        return cls(seeds=4, steps=200, cure_seeds=4, cure_steps=300, sweep_seeds=2, sweep_steps=100)
+        return cls(seeds=4, steps=200, cure_seeds=4, cure_steps=300, sweep_seeds=2, sweep_steps=100, simplex=False)

@@ -10,10 +10,12 @@ import pytest
 import xarray
 
 import perfcontrol as pc
+from perfcontrol import results
 from perfcontrol.config import REGIMES, ReproduceSettings
 from perfcontrol.experiments import reproduce as module
 from perfcontrol.experiments.batches import in_single_precision
 from perfcontrol.experiments.reproduce import Outcome, reproduce
+from perfcontrol.plotting import paper_figures
 from perfcontrol.report import paper_claims
 
 SETTINGS = ReproduceSettings(seeds=3, steps=100, cure_steps=200, sweep_seeds=2, sweep_steps=100)
@@ -49,8 +51,8 @@ def test_runs_equal_single_solves_with_the_same_key(done: tuple[Path, Outcome]) 
     order, seed = 1, 2
     problem = pc.experiments.stock_market("descending", growth=REGIMES["stable"])
     single = in_single_precision(problem)
-    key = module._keys(SETTINGS, 2, 3 * SETTINGS.seeds)[order * SETTINGS.seeds + seed]
-    M0 = module._starts(module.stack_problems([single]), SETTINGS, SETTINGS.seeds)[seed]
+    key = jax.random.fold_in(jax.random.key(SETTINGS.seed), 2_000_000 + order * SETTINGS.seeds + seed)
+    M0 = module._starts(SETTINGS, problem, SETTINGS.seeds)[seed].astype(np.float32)
     solution = pc.solve(single, pc.RSGD(SETTINGS.steps, SETTINGS.step_size / 60), M0, key=key)
     stable = runs["stable_policy"].sel(regime="stable", order="descending").values
     picked = runs.sel(regime="stable", order="descending", seed=seed)
@@ -70,6 +72,25 @@ def test_claims_are_complete_and_existence_is_settled(done: tuple[Path, Outcome]
     assert existence["value"] <= 1e-11
     printed = next(claim for claim in claims if "N(log ε_t" in claim["claim"])
     assert printed["verdict"] == "does not hold"
+
+
+def test_without_the_simplex_its_claim_and_its_curve_are_left_out(done: tuple[Path, Outcome], tmp_path: Path) -> None:
+    data = {name: results.load_dataset(done[0] / f"{name}.nc") for name in STAGES}
+    exact, runs, sweep, cure = data["exact"], data["runs"], data["sweep"], data["cure"].drop_vars("simplex")
+    claims = paper_claims.judge(exact, None, runs, cure, sweep, SETTINGS)
+    missing = {claim.claim for claim in done[1].claims} - {claim.claim for claim in claims}
+    assert len(missing) == 1
+    assert "simplex" in missing.pop()
+    assert paper_figures.draw_all(tmp_path, exact, runs, cure, sweep, SETTINGS)
+
+
+@pytest.mark.slow
+def test_quoted_thresholds_are_those_of_the_theory() -> None:
+    problems = module._problems(SETTINGS, "rows")
+    exact = module.exact_stage(problems, SETTINGS, module._silent)
+    quoted = module.mean_square_thresholds(SETTINGS, exact)
+    np.testing.assert_allclose(module.computed_thresholds(SETTINGS, exact), quoted, rtol=0.15)
+    assert np.all(np.diff(quoted[[1, 2, 0]]) > 0)
 
 
 def test_finished_stages_are_read_and_give_the_same_claims(done: tuple[Path, Outcome], tmp_path: Path) -> None:

@@ -100,19 +100,20 @@ class QuadraticCost(AbstractCost):
 
     def form(self, horizon: int) -> QuadraticForm:
         """The cost as a quadratic form on z = [x; u] for t = 0..horizon."""
-        length = horizon + 1
-        matrix = self._joint(length)
-        target = self._target(length)
-        linear = -jnp.einsum("tij,tj->ti", matrix, target)
-        return QuadraticForm(matrix, linear, -jnp.einsum("ti,ti->t", linear, target))
+        linear, constant = self.linear_terms(horizon)
+        return QuadraticForm(self._joint(horizon + 1), linear, constant)
 
-    def _target(self, length: int) -> Array:
+    @property
+    def has_targets(self) -> bool:
+        """Whether the form has linear terms."""
+        return self.state_target is not None or self.input_target is not None
+
+    def linear_terms(self, horizon: int) -> tuple[Float[Array, "T1 p"], Float[Array, " T1"]]:
+        """`linear` and `constant` of the form: the half gradients at z = 0, and what the targets cost there."""
         n, m = self.Q.shape[-1], self.R.shape[-1]
-        parts = [
-            jnp.zeros((length, size), self.Q.dtype) if target is None else along_time(target, 1, length)
-            for target, size in ((self.state_target, n), (self.input_target, m))
-        ]
-        return jnp.concatenate(parts, axis=-1)
+        x, u = (jnp.zeros((horizon + 1, size), self.Q.dtype) for size in (n, m))
+        by_state, by_input = self._half_gradients(*self._centred(x, u))
+        return jnp.concatenate([by_state, by_input], axis=-1), self.path_cost(x, u)
 
     def _centred(self, x: Array, u: Array) -> tuple[Array, Array]:
         x = x if self.state_target is None else x - self.state_target

@@ -29,11 +29,14 @@ class CostToGo(eqx.Module):
     """What the deployed policy makes of the world; none of it depends on the evaluated policy.
 
     Lambda: (T+1, n, n) cost-to-go. S: (T+1, m, m) curvature in the feedforward v_t. D: (T+1, m, n) its coupling to
-    the state. F: (T, n, n) mean closed loop. B: (T, n, m) mean input matrix, Θ included. noise_mean: (n,) or (T, n) and
-    noise_covariance: (n, n) or (T, n, n), of the law of w_t.
+    the state. R, N: the parts of S and D that are not BᵀΛB and BᵀΛF: stage cost and perturbation of the input; with
+    the axis T+1 where they vary, N None where there is no coupling. F: (T, n, n) mean closed loop. B: (T, n, m) mean
+    input matrix, Θ included. noise_mean: (n,) or (T, n) and noise_covariance: (n, n) or (T, n, n), of the law of w_t.
     """
 
     Lambda: Float[Array, "T1 n n"]
+    R: Float[Array, "*steps m m"]
+    N: Float[Array, "*steps m n"] | None
     S: Float[Array, "T1 m m"]
     D: Float[Array, "T1 m n"]
     F: Matrix
@@ -80,20 +83,23 @@ def mean_dynamics(problem: PerformativeProblem, reacting: Array) -> tuple[Array,
     return joint, jnp.broadcast_to(eye, (T + 1, n + m, n + m)).at[:, n:, :n].set(-problem.gains())
 
 
-def _stage_weights(problem: PerformativeProblem) -> tuple[Array, Array, Array]:
-    """The stage weight seen through u = v - K x: on x, (n, n); between v and x, (m, n); on v, (m, m).
+def _stage_weights(problem: PerformativeProblem) -> tuple[Array, Array | None, Array]:
+    """The stage weight seen through u = v - K x: on x, (n, n); between v and x, (m, n), None for zero; on v, (m, m).
 
     Each with a leading axis T+1 where it varies in time.
     """
     cost = problem.cost
     assert isinstance(cost, QuadraticCost)
     Q, R, cross = cost.Q, cost.R, cost.cross
-    between = jnp.zeros((problem.input_size, problem.state_size), Q.dtype) if cross is None else transpose(cross)
+    between = None if cross is None else transpose(cross)
     if not problem.has_gain:
         return Q, between, R
     K = problem.gain
+    on_x = Q + transpose(K) @ R @ K
+    if between is None:
+        return on_x, -R @ K, R
     mixed = transpose(K) @ between
-    return Q + transpose(K) @ R @ K - mixed - transpose(mixed), between - R @ K, R
+    return on_x - mixed - transpose(mixed), between - R @ K, R
 
 
 def cost_to_go(problem: PerformativeProblem, reacting: Array) -> CostToGo:
@@ -126,20 +132,23 @@ def cost_to_go(problem: PerformativeProblem, reacting: Array) -> CostToGo:
     steps = (F, on_x[:-1] if on_x.ndim == 3 else None, spread.steps, state_part if on_input else None)
     _, earlier = jax.lax.scan(retreat, last, steps, reverse=True)
     Lambda = jnp.concatenate([earlier, last[None]])
+    if on_input:
+        reaction = spread.adjoint(Lambda[1:])[:, n:, :]
+        last_stage = ((0, 1), (0, 0), (0, 0))  # nothing reacts after it
+        on_v = on_v + jnp.pad(reaction[:, :, n:], last_stage)
+        between = jnp.pad(reaction @ state_part, last_stage) + (0 if between is None else between)
     # What couples to v needs no recursion: in bulk over time.
     pulled = transpose(B) @ Lambda[1:]
-    S, D = pulled @ B, pulled @ F
-    if on_input:
-        reaction = spread.adjoint(Lambda[1:])
-        S, D = S + reaction[:, n:, n:], D + reaction[:, n:, :] @ state_part
 
-    def with_stage(stage: Array, moved: Array) -> Array:
-        stage = along_time(stage, 2, T + 1)
-        return jnp.concatenate([stage[:-1] + moved, stage[-1:]])
+    def with_stage(stage: Array | None, moved: Array) -> Array:
+        if stage is None:
+            return jnp.pad(moved, ((0, 1), (0, 0), (0, 0)))
+        stages: Array = along_time(stage, 2, T + 1)
+        return jnp.concatenate([stages[:-1] + moved, stages[-1:]])
 
-    S, D = with_stage(on_v, S), with_stage(between, D)
+    S, D = with_stage(on_v, pulled @ B), with_stage(between, pulled @ F)
     noise = problem.noise_under(reacting)
-    return CostToGo(Lambda, S, D, F, B, noise.mean, noise.covariance)
+    return CostToGo(Lambda, on_v, between, S, D, F, B, noise.mean, noise.covariance)
 
 
 def _chains(world: CostToGo, memory: int) -> tuple[list[Array], list[Array]]:
@@ -222,14 +231,17 @@ def mean_path(
     The multiplicative noise that the mean path excites is included: Λ carries it.
     """
     n, T = problem.state_size, problem.horizon
-    form = problem.cost.form(T)  # type: ignore[attr-defined]
-    linear, constant = (form.linear, form.constant) if targets else (form.linear * 0, form.constant * 0)
-    moved = jnp.einsum("tij,tj->ti", world.Lambda[1:], w)  # Λ_{t+1} w_t
-    by_input_stage = linear[:, n:]
-    by_state_stage = linear[:, :n]
-    if problem.has_gain:
-        by_state_stage = by_state_stage - problem.feedback_adjoint(by_input_stage)
-    source = by_state_stage + jnp.einsum("tmn,tm->tn", world.D, v)
+    cost = problem.cost
+    assert isinstance(cost, QuadraticCost)
+    push = input_term(world.B, v) + w
+    moved = matvec(world.Lambda[1:], push)
+    source, by_input_stage, constant = jnp.zeros((T + 1, n), v.dtype), 0, 0
+    if targets and cost.has_targets:
+        linear, constant = cost.linear_terms(T)
+        by_input_stage = linear[:, n:]
+        source = linear[:, :n] - problem.feedback_adjoint(by_input_stage)
+    if world.N is not None:
+        source = source + rmatvec(world.N, v)
 
     def retreat(p: Array, step: Any) -> tuple[Array, Array]:
         F_t, source_t, moved_t = step
@@ -239,16 +251,19 @@ def mean_path(
 
     def advance(mu: Array, step: Any) -> tuple[Array, Array]:
         F_t, push_t = step
-        return matvec(F_t, mu) + push_t, mu
+        following = matvec(F_t, mu) + push_t
+        return following, following
 
-    push = input_term(world.B, v) + w
-    last, earlier = jax.lax.scan(advance, x0, (world.F, push))
-    mu = jnp.concatenate([earlier, last[None]])
-    Sv = jnp.einsum("tij,tj->ti", world.S, v)
-    half = by_input_stage.at[:-1].add(input_adjoint(world.B, moved + p_next))
-    cost = jnp.sum(v * (Sv + 2 * half)) + jnp.sum(w * (moved + 2 * p_next)) + jnp.sum(constant)
-    cost = cost + x0 @ (world.Lambda[0] @ x0 + 2 * p0)
-    return cost, 2 * (jnp.einsum("tmn,tn->tm", world.D, mu) + Sv + half)
+    _, mu = jax.lax.scan(advance, x0, (world.F, push))
+    # x' Λ x + 2 p' x is what lies ahead: each push adds its own to it, and by_v is what it adds at the margin.
+    total = x0 @ (world.Lambda[0] @ x0 + 2 * p0) + jnp.sum(push * (moved + 2 * p_next)) + jnp.sum(constant)
+    weighed = matvec(world.R, v)
+    total = total + jnp.sum(v * (weighed + 2 * by_input_stage))
+    margin = input_adjoint(world.B, matvec(world.Lambda[1:], mu) + p_next)
+    by_v = weighed + by_input_stage + jnp.pad(margin, ((0, 1), (0, 0)))
+    if world.N is not None:
+        by_v = by_v + matvec(world.N, jnp.concatenate([x0[None], mu]))
+    return total, 2 * by_v
 
 
 def cost_and_gradient(problem: PerformativeProblem, world: CostToGo, policy: Array) -> tuple[Array, Array]:

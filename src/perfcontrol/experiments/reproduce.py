@@ -7,57 +7,43 @@ Stages: `exact` (stable points without sampling), `runs` (the paper's RSGD), `cu
 import hashlib
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import xarray
-from jaxtyping import Array
 
 from perfcontrol import results
 from perfcontrol.config import REGIMES, ReproduceSettings
-from perfcontrol.evaluate.exact import exact_cost, expected_cost
-from perfcontrol.experiments.batches import in_single_precision, map_over_devices, pick, stack_problems
-from perfcontrol.experiments.stock import HORIZON, ORDERS, stock_market
+from perfcontrol.evaluate.exact import expected_cost
+from perfcontrol.experiments.batches import CEILING, Ended, Runner, Runs, StepRule, stack_problems
+from perfcontrol.experiments.stock import HORIZON, ORDERS, STOCKS, stock_market
 from perfcontrol.plotting import paper_figures
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.report import paper_claims
 from perfcontrol.report.claims import Claim, as_markdown
-from perfcontrol.solvers import RRM, RSGD, Result, StablePoint, solve
-from perfcontrol.solvers.loop import State, run_steps
+from perfcontrol.solvers import RRM, StablePoint, solve
+from perfcontrol.theory import mean_square_stability
 
-CEILING = 1e30  # costs of runaway policies are astronomical: recorded as this
-COST_BLOCK = 8192  # policies whose exact cost is computed in one compiled call
-CHUNK = 100  # iterations in one compiled call
+UNSTABLE = list(REGIMES).index("unstable") * len(ORDERS)  # its first case
+STAGES = ("exact", "exact_simplex", "runs", "cure", "sweep")
 STARTS = 4  # further starts of the exact solver in each case
 DIMINISHING_OFFSET = 10.0  # η_n = step 10 / (n + 10)
 SMALL_STEP = 0.1  # the smaller constant step, relative to the paper's
 SWEEP_FACTORS = (0.25, 0.5, 0.7, 0.85, 1.0, 1.2, 1.5, 2.0)
-# Largest constant step (on the stage average) for which the linearised iteration is stable in mean square, A = I:
-# computed once by the operator of the sharp analysis, quoted here beside the simulated onset.
-MEAN_SQUARE_THRESHOLDS = {"ascending": 0.0240, "random": 0.0090, "descending": 0.0046}
+# Largest constant step (on the stage average) that is stable in mean square, default market, unstable regime: by the
+# operator of `computed_thresholds` on 16,384 sampled Jacobians, within one per cent.
+MEAN_SQUARE_THRESHOLDS = {"ascending": 0.0236, "random": 0.00898, "descending": 0.00461}
 
 Progress = Callable[[str, float], None]
 
 
 def _silent(stage: str, share: float) -> None:
     """No progress shown."""
-
-
-class StepRule(eqx.Module):
-    """η_n = constant + phi1/(n + phi2): one compiled program for constant and diminishing steps."""
-
-    constant: Array
-    phi1: Array
-    phi2: Array
-
-    def __call__(self, n: Array) -> Array:
-        return self.constant + self.phi1 / (n + self.phi2)
 
 
 class Outcome(NamedTuple):
@@ -68,67 +54,12 @@ class Outcome(NamedTuple):
     seconds: dict[str, float]
 
 
-class _Runner:
-    """RSGD on many (case, seed) pairs at once, in compiled calls of `CHUNK` iterations.
-
-    In single precision: its rounding is far below the sampling noise of the runs, and they take half the time.
-    """
-
-    def __init__(self, problems: PerformativeProblem):
-        self.problems = in_single_precision(problems)
-        self._start = map_over_devices(self._start_one)
-        self._advance = map_over_devices(self._advance_one)
-        self._costs = map_over_devices(lambda case, M: exact_cost(pick(self.problems, case), M, M), batch=1)
-
-    def _solver(self, rule: StepRule) -> RSGD:
-        return RSGD(CHUNK, rule)
-
-    def _start_one(self, case: Array, M0: Array, rule: StepRule) -> State:
-        return self._solver(rule).init(pick(self.problems, case), M0)
-
-    def _advance_one(self, case: Array, state: State, key: Array, rule: StepRule, first: Array) -> Any:
-        return run_steps(self._solver(rule), pick(self.problems, case), state, key, first, CHUNK)
-
-    def iterates(
-        self, cases: Array, starts: Array, keys: Array, rule: StepRule, steps: int
-    ) -> Iterator[tuple[State, Array]]:
-        """States and iterates (run, CHUNK, ...) after each chunk, the last one cut to `steps`."""
-        state = self._start(cases, starts, rule)
-        for first in range(0, steps, CHUNK):
-            offset = jnp.full(cases.shape, first)
-            state, visited = self._advance(cases, state, keys, rule, offset)
-            yield state, visited[:, : steps - first]
-
-    def costs(self, cases: Array, policies: np.ndarray, taken: np.ndarray) -> np.ndarray:
-        """Exact C_T(M; M) of every policy (run, step, ...), `CEILING` where it is larger or overflows.
-
-        Policies past the step at which a run ended repeat its last one: their cost is not computed again.
-        """
-        runs, steps = policies.shape[:2]
-        last = np.minimum(np.arange(steps), taken[:, None])
-        which = np.flatnonzero(np.arange(steps) == last)
-        flat, case = policies.reshape(-1, *policies.shape[2:]), np.repeat(np.asarray(cases), steps)
-        values = np.empty(runs * steps)
-        for first in range(0, len(which), COST_BLOCK):
-            block = which[first : first + COST_BLOCK]
-            filled = np.resize(block, COST_BLOCK)  # the last block repeats itself: one compiled shape for all
-            values[block] = np.asarray(self._costs(case[filled], flat[filled]))[: len(block)]
-        spread = np.take_along_axis(values.reshape(runs, steps), last, axis=1)
-        return np.where(spread < CEILING, spread, CEILING)  # False for what is not finite
-
-
-def _starts(problems: PerformativeProblem, settings: ReproduceSettings, count: int) -> Array:
-    """Random portfolios, one a seed: nonnegative rows of the required sum."""
-    problem = pick(problems, jnp.asarray(0))
-    raw = jax.random.uniform(
-        jax.random.fold_in(jax.random.key(settings.seed), 1), (count, *problem.policy_shape), problem.dtype
-    )
-    assert problem.feasible_set.row_total is not None
-    return raw / jnp.sum(raw, axis=-1, keepdims=True) * problem.feasible_set.row_total
-
-
-def _keys(settings: ReproduceSettings, stage: int, count: int) -> Array:
-    return jax.random.split(jax.random.fold_in(jax.random.key(settings.seed), stage), count)
+def _starts(settings: ReproduceSettings, problem: PerformativeProblem, count: int) -> np.ndarray:
+    """Random portfolios (count, 1, L, L), one a seed: nonnegative rows of the required sum."""
+    total = problem.feasible_set.row_total
+    assert total is not None
+    raw = np.random.default_rng([settings.seed, 1]).uniform(size=(count, 1, STOCKS, STOCKS))
+    return raw / raw.sum(axis=-1, keepdims=True) * float(total)
 
 
 def _problems(
@@ -153,193 +84,206 @@ def _problems(
 _CASES = {"regime": list(REGIMES), "order": list(ORDERS)}
 
 
-def _by_case(values: list[Any]) -> np.ndarray:
-    array = np.asarray(values)
-    return array.reshape(len(REGIMES), len(ORDERS), *array.shape[1:])
+def _by_case(rows: dict[str, list[Any]]) -> xarray.Dataset:
+    """One value a case, matrices included, by regime and order."""
+    cases, arrays = ("regime", "order"), {name: np.asarray(values) for name, values in rows.items()}
+    data = {
+        name: (
+            (*cases, "row", "column")[: array.ndim + 1],
+            array.reshape(len(REGIMES), len(ORDERS), *array.shape[1:]),
+        )
+        for name, array in arrays.items()
+    }
+    return xarray.Dataset(data, coords=_CASES)
 
 
 # --- stages ----------------------------------------------------------------------------------------------------------
 
 
-def exact_stage(settings: ReproduceSettings, feasible_set: str, progress: Progress) -> xarray.Dataset:
+def exact_stage(problems: list[PerformativeProblem], settings: ReproduceSettings, progress: Progress) -> xarray.Dataset:
     """Stable points of all cases without sampling, with the evidence that they are such and the only ones."""
-    problems = _problems(settings, feasible_set)
-    rows: dict[str, list[Any]] = {
-        name: [] for name in ("M", "residual", "unique", "rate", "agreement", "cost", "spread")
-    }
-    starts = _starts(stack_problems(problems), settings, STARTS)
+    rows: dict[str, list[Any]] = {name: [] for name in ("M", "residual", "unique", "spread")}
     for index, problem in enumerate(problems):
         stable = solve(problem, StablePoint(), throw=False)
-        # A start a hundred portfolios away, to see that repeated minimisation contracts, and how fast.
-        away = problem.feasible_set.project(100 * starts[0])
-        repeated = solve(problem, RRM(), away, throw=False)
+        M = np.asarray(stable.M)
         others = [
-            solve(problem, StablePoint(), problem.feasible_set.project(10 * start), throw=False).M for start in starts
+            np.asarray(solve(problem, StablePoint(), start, throw=False).M)
+            for start in _starts(settings, problem, STARTS)
         ]
-        scale = jnp.linalg.norm(stable.M)
-        rows["M"].append(np.asarray(stable.M[0]))
+        rows["M"].append(M[0])
         rows["residual"].append(float(stable.stats["residual"]))
         rows["unique"].append(bool(stable.stats["unique"]))
+        rows["spread"].append(max(float(np.linalg.norm(other - M)) for other in others) / float(np.linalg.norm(M)))
+        progress("exact stable points", (index + 1) / len(problems))
+    return _by_case(rows)
+
+
+def repeated_minimisation(
+    problems: list[PerformativeProblem], exact: xarray.Dataset, settings: ReproduceSettings
+) -> xarray.Dataset:
+    """`exact` with repeated minimisation beside it: where it ends from afar, how fast it contracts; exact costs.
+
+    And with the volatility as printed: how much of anything still depends on the policy.
+    """
+    rows: dict[str, list[Any]] = {name: [] for name in ("rate", "agreement", "cost")}
+    starts = _starts(settings, problems[0], 2)
+    project = jax.jit(lambda problem, M: problem.feasible_set.project(M))
+    for problem, M in zip(problems, exact["M"].values.reshape(len(problems), 1, STOCKS, STOCKS), strict=True):
+        # A start a hundred portfolios away, to see that it contracts.
+        repeated = solve(problem, RRM(), project(problem, 100 * starts[0]), throw=False)
         rate = float(repeated.stats["rate"])
         rows["rate"].append(rate if np.isfinite(rate) else 0.0)  # converged at once: no ratio to take
-        rows["agreement"].append(float(jnp.linalg.norm(repeated.M - stable.M) / scale))
-        rows["spread"].append(float(max(jnp.linalg.norm(other - stable.M) for other in others) / scale))
-        rows["cost"].append(float(expected_cost(problem, stable.M)))
-        progress("exact stable points", (index + 1) / len(problems))
-    cases = ("regime", "order")
-    return xarray.Dataset(
-        {
-            name: ((*cases, "row", "column") if name == "M" else cases, _by_case(values))
-            for name, values in rows.items()
-        },
-        coords=_CASES,
+        rows["agreement"].append(float(np.linalg.norm(np.asarray(repeated.M) - M) / np.linalg.norm(M)))
+        rows["cost"].append(float(expected_cost(problem, M)))
+    perturbation: Any = _problems(settings, settings.feasible_set, "as_printed")[0].perturbation
+    # Exact evaluation sees a perturbation's moments alone: those as printed, in the program that is compiled already.
+    printed = eqx.tree_at(
+        lambda p: (p.perturbation.first_moment, p.perturbation.variance),
+        problems[0],
+        (perturbation.first_moment, perturbation.variance),
+    )
+    ends = [solve(printed, RRM(), start, throw=False) for start in starts]
+    responses = [np.asarray(end.history[1]) for end in ends]
+    return exact.merge(_by_case(rows)).assign(
+        printed_variance=float(np.max(np.abs(np.asarray(perturbation.variance)))),
+        printed_steps=max(int(end.steps) for end in ends),
+        printed_difference=float(np.max(np.abs(responses[0] - responses[1]))),
     )
 
 
-def run_stage(
-    runner: _Runner, exact: xarray.Dataset, settings: ReproduceSettings, progress: Progress
-) -> xarray.Dataset:
+class _Laboratory(NamedTuple):
+    """What the stages with runs share: the compiled runner of a feasible set, its stable policies, the starts."""
+
+    runner: Runner
+    exact: xarray.Dataset
+    starts: np.ndarray
+
+    def runs(self, stage: int, case: np.ndarray, stream: np.ndarray, seed: np.ndarray, step: StepRule) -> Runs:
+        """One run for each entry of the index arrays; `stage` keeps the random numbers of stages apart."""
+        rule = jax.tree.map(lambda value: np.broadcast_to(np.float32(value), case.shape), step)
+        return Runs(case, stage * 1_000_000 + stream, self.starts[seed], rule)
+
+    def errors(self, runs: Runs, ended: Ended) -> np.ndarray:
+        """‖M_n - M^PS‖²_F, (rows, steps+1)."""
+        stable = self.exact["M"].values.reshape(-1, *ended.policies.shape[-2:])[runs.case[ended.rows]]
+        return np.sum((ended.policies[:, :, 0] - stable[:, None]) ** 2, axis=(-2, -1))
+
+
+def _laboratory(settings: ReproduceSettings, problems: list[PerformativeProblem], exact: xarray.Dataset) -> _Laboratory:
+    seeds = max(settings.seeds, settings.cure_seeds, settings.sweep_seeds)
+    starts = _starts(settings, problems[0], seeds).astype(np.float32)
+    return _Laboratory(Runner(stack_problems(problems), jax.random.key(settings.seed)), exact, starts)
+
+
+def _constant(step: Any) -> StepRule:
+    return StepRule(step / HORIZON, 0.0, 1.0)
+
+
+def _diminishing(step: float) -> StepRule:
+    return StepRule(0.0, step / HORIZON * DIMINISHING_OFFSET, DIMINISHING_OFFSET)
+
+
+def run_stage(lab: _Laboratory, settings: ReproduceSettings, progress: Progress) -> xarray.Dataset:
     """The paper's RSGD: error and exact cost of every iterate."""
-    seeds, steps = settings.seeds, settings.steps
+    seeds, length = settings.seeds, settings.steps + 1
     shape = (len(REGIMES), len(ORDERS), seeds)
-    error, cost = np.empty((*shape, steps + 1)), np.empty((*shape, steps + 1))
-    result, taken = np.empty(shape, dtype=object), np.empty(shape, dtype=int)
-    starts = jnp.tile(_starts(runner.problems, settings, seeds), (len(ORDERS), 1, 1, 1))
-    keys = _keys(settings, 2, len(ORDERS) * seeds)
-    rule = _constant(settings.step_size, keys.shape[0])
-    for r, regime in enumerate(REGIMES):
-        cases = jnp.repeat(jnp.arange(len(ORDERS)) + r * len(ORDERS), seeds)
-        target = exact["M"].sel(regime=regime).values[:, None, None]
-        blocks = [np.asarray(starts[:, None])]
-        final = None
-        for state, visited in runner.iterates(cases, starts, keys, rule, steps):
-            final = state
-            blocks.append(np.asarray(visited))
-            progress("RSGD runs", (r + 0.5 * (len(blocks) - 1) * CHUNK / steps) / len(REGIMES))
-        assert final is not None
-        result[r], taken[r] = _named(final, shape[1:])
-        policies = np.concatenate(blocks, axis=1)
-        error[r] = np.sum((policies.reshape(*shape[1:], steps + 1, *policies.shape[-2:]) - target) ** 2, axis=(-2, -1))
-        cost[r] = runner.costs(cases, policies, taken[r].reshape(-1)).reshape(cost[r].shape)
-        progress("RSGD runs", (r + 1) / len(REGIMES))
+    regime, order, seed = np.indices(shape).reshape(3, -1)
+    # Regimes share their random numbers: what differs between the panels is the regime.
+    case, stream = regime * len(ORDERS) + order, order * seeds + seed
+    runs = lab.runs(2, case, stream, seed, _constant(settings.step_size))
+    error, cost = np.empty((2, case.size, length))
+    result, taken = np.empty(case.size, dtype="<U9"), np.empty(case.size, dtype=int)
+    for ended in lab.runner.run(runs, settings.steps, lambda share: progress("RSGD runs", share)):
+        error[ended.rows] = lab.errors(runs, ended)
+        cost[ended.rows] = lab.runner.costs(runs, ended)
+        result[ended.rows], taken[ended.rows] = ended.result, ended.steps_taken
     dims = ("regime", "order", "seed")
+    per_step = ((*dims, "step"), (*shape, length))
     data = {
-        "error": ((*dims, "step"), error, {"long_name": "squared Frobenius distance to the stable policy"}),
+        "error": (per_step[0], error.reshape(per_step[1]), {"long_name": "squared distance to the stable policy"}),
         "cost": (
-            (*dims, "step"),
-            cost,
+            per_step[0],
+            cost.reshape(per_step[1]),
             {"long_name": f"expected total cost C_T(M_n; M_n), exact to single precision, at most {CEILING:g}"},
         ),
-        "result": (dims, result.astype(str), {"long_name": "how the run ended"}),
-        "steps_taken": (dims, taken, {"long_name": "iterations until the run ended"}),
-        "stable_policy": (("regime", "order", "row", "column"), exact["M"].values),
-        "stable_cost": (("regime", "order"), exact["cost"].values),
+        "result": (dims, result.reshape(shape), {"long_name": "how the run ended"}),
+        "steps_taken": (dims, taken.reshape(shape), {"long_name": "iterations until the run ended"}),
+        "stable_policy": (("regime", "order", "row", "column"), lab.exact["M"].values),
+        "stable_cost": (("regime", "order"), lab.exact["cost"].values),
     }
-    return xarray.Dataset(data, coords={**_CASES, "seed": np.arange(seeds), "step": np.arange(steps + 1)})
+    return xarray.Dataset(data, coords={**_CASES, "seed": np.arange(seeds), "step": np.arange(length)})
 
 
 def cure_stage(
-    runner: _Runner,
-    exact: xarray.Dataset,
-    bounded: _Runner,
-    exact_bounded: xarray.Dataset,
-    settings: ReproduceSettings,
-    progress: Progress,
+    lab: _Laboratory, bounded: _Laboratory | None, settings: ReproduceSettings, progress: Progress
 ) -> xarray.Dataset:
     """The unstable regime again: with a diminishing step, with a smaller one, and on the bounded simplex."""
-    seeds = settings.cure_seeds
-    r = list(REGIMES).index("unstable")
-    cases = jnp.repeat(jnp.arange(len(ORDERS)) + r * len(ORDERS), seeds)
-    starts = jnp.tile(_starts(runner.problems, settings, seeds), (len(ORDERS), 1, 1, 1))
-    keys = _keys(settings, 3, cases.shape[0])
+    shape = (len(ORDERS), settings.cure_seeds)
+    order, seed = np.indices(shape).reshape(2, -1)
     step = settings.step_size
     plans = {
-        "diminishing": (runner, exact, _diminishing(step, cases.shape[0]), settings.cure_steps),
-        "smaller": (runner, exact, _constant(SMALL_STEP * step, cases.shape[0]), settings.steps),
-        "simplex": (bounded, exact_bounded, _constant(step, cases.shape[0]), settings.steps),
+        "diminishing": (lab, _diminishing(step), settings.cure_steps),
+        "smaller": (lab, _constant(SMALL_STEP * step), settings.steps),
     }
+    if bounded is not None:
+        plans["simplex"] = (bounded, _constant(step), settings.steps)
     data: dict[str, Any] = {}
-    total = sum(steps for *_, steps in plans.values())
-    done = 0
-    for name, (engine, stable, rule, steps) in plans.items():
-        target = stable["M"].sel(regime="unstable").values[:, None, None]
-        errors = []
-        for _, visited in engine.iterates(cases, starts, keys, rule, steps):
-            part = np.asarray(visited).reshape(len(ORDERS), seeds, visited.shape[1], *visited.shape[-2:])
-            errors.append(np.sum((part - target) ** 2, axis=(-2, -1)))
-            done += visited.shape[1]
-            progress("what cures divergence", done / total)
-        data[name] = (("order", "seed", f"step_{name}"), np.concatenate(errors, axis=-1))
+    total, before = sum(steps for *_, steps in plans.values()), 0
+    for name, (place, rule, steps) in plans.items():
+
+        def show(share: float, before: int = before, steps: int = steps) -> None:
+            progress("what cures divergence", (before + share * steps) / total)
+
+        runs = place.runs(3, UNSTABLE + order, np.arange(order.size), seed, rule)
+        errors = np.empty((order.size, steps + 1))
+        for ended in place.runner.run(runs, steps, show):
+            errors[ended.rows] = place.errors(runs, ended)
+        data[name] = (("order", "seed", f"step_{name}"), errors[:, 1:].reshape(*shape, steps))
         data[f"step_{name}"] = ((f"step_{name}",), np.arange(1, steps + 1))
-    return xarray.Dataset(data, coords={"order": list(ORDERS), "seed": np.arange(seeds)})
+        before += steps
+    return xarray.Dataset(data, coords={"order": list(ORDERS), "seed": np.arange(settings.cure_seeds)})
 
 
-def sweep_stage(
-    runner: _Runner, exact: xarray.Dataset, settings: ReproduceSettings, progress: Progress
-) -> xarray.Dataset:
+def sweep_stage(lab: _Laboratory, settings: ReproduceSettings, progress: Progress) -> xarray.Dataset:
     """Constant steps around the mean-square thresholds of the unstable regime: which runs do not come closer."""
-    seeds, factors = settings.sweep_seeds, np.asarray(SWEEP_FACTORS)
-    r = list(REGIMES).index("unstable")
-    grid = (len(ORDERS), len(factors), seeds)
+    factors = np.asarray(SWEEP_FACTORS)
+    grid = (len(ORDERS), len(factors), settings.sweep_seeds)
     order, factor, seed = np.indices(grid).reshape(3, -1)
-    threshold = np.asarray([MEAN_SQUARE_THRESHOLDS[name] for name in ORDERS])
-    step = threshold[order] * factors[factor]
-    starts = _starts(runner.problems, settings, seeds)[seed]
-    rule = _constant(jnp.asarray(step), len(step))
-    cases = jnp.asarray(order + r * len(ORDERS))
-    keys = _keys(settings, 4, len(step))
-    final, done = None, 0
-    for state, visited in runner.iterates(cases, starts, keys, rule, settings.sweep_steps):
-        final, done = (state, visited), done + CHUNK
-        progress("where divergence begins", done / settings.sweep_steps)
-    assert final is not None
-    state, last = final
-    target = exact["M"].sel(regime="unstable").values[order]
-    error = np.sum((np.asarray(last)[:, -1, 0] - target) ** 2, axis=(-2, -1)).reshape(grid)
-    start = np.sum((np.asarray(starts)[:, 0] - target) ** 2, axis=(-2, -1)).reshape(grid)
+    threshold = mean_square_thresholds(settings, lab.exact)
+    rule = _constant(threshold[order] * factors[factor])
+    runs = lab.runs(4, UNSTABLE + order, np.arange(order.size), seed, rule)
+    relative, result = np.empty(order.size), np.empty(order.size, dtype="<U9")
+    for ended in lab.runner.run(runs, settings.sweep_steps, lambda share: progress("where divergence begins", share)):
+        error = lab.errors(runs, ended)
+        relative[ended.rows], result[ended.rows] = error[:, -1] / error[:, 0], ended.result
     return xarray.Dataset(
         {
-            "relative_error": (("order", "factor", "seed"), error / start),
+            "relative_error": (("order", "factor", "seed"), relative.reshape(grid)),
             "threshold": (("order",), threshold),
-            "result": (("order", "factor", "seed"), _named(state, grid)[0].astype(str)),
+            "result": (("order", "factor", "seed"), result.reshape(grid)),
         },
-        coords={"order": list(ORDERS), "factor": factors, "seed": np.arange(seeds)},
+        coords={"order": list(ORDERS), "factor": factors, "seed": np.arange(settings.sweep_seeds)},
     )
 
 
-def as_printed_stage(settings: ReproduceSettings) -> dict[str, float]:
-    """The volatility as printed: how much of anything still depends on the policy."""
-    problem = _problems(settings, "rows", "as_printed")[0]
-    perturbation = problem.perturbation
-    variance = np.asarray(perturbation.variance)  # type: ignore[attr-defined]
-    first = _starts(stack_problems([problem]), settings, 2)
-    far = [solve(problem, RRM(), start, throw=False) for start in first]
-    return {
-        "largest_variance": float(np.max(np.abs(variance))),
-        "steps_of_rrm": float(max(int(solution.steps) for solution in far)),
-        "response_difference": float(jnp.max(jnp.abs(far[0].history[1] - far[1].history[1]))),
-    }
+def mean_square_thresholds(settings: ReproduceSettings, exact: xarray.Dataset) -> np.ndarray:
+    """Largest constant step (on the stage average) that is stable in mean square, unstable regime, by order.
+
+    Quoted where the market is the default one, else computed (some ten seconds).
+    """
+    market = ("feasible_set", "initial_investment", "rate", "trading_hours")
+    default = ReproduceSettings()
+    if all(getattr(settings, name) == getattr(default, name) for name in market):
+        return np.asarray([MEAN_SQUARE_THRESHOLDS[order] for order in ORDERS])
+    return computed_thresholds(settings, exact)
 
 
-def _constant(step: Any, count: int) -> StepRule:
-    size = jnp.broadcast_to(jnp.asarray(step, dtype=jnp.float32) / HORIZON, (count,))
-    return StepRule(size, jnp.zeros_like(size), jnp.ones_like(size))
-
-
-def _diminishing(step: float, count: int) -> StepRule:
-    offset = jnp.full(count, DIMINISHING_OFFSET, dtype=jnp.float32)
-    return StepRule(jnp.zeros_like(offset), step / HORIZON * offset, offset)
-
-
-def _named(state: State, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Result names and step counts of a batch of states."""
-    names = ("running", "diverged", "nonfinite")
-    codes = {name: np.asarray(getattr(Result, name)._value) for name in names}
-    values = np.asarray(state.result._value).reshape(shape)
-    named = np.full(shape, "success", dtype=object)
-    for name in names[1:]:
-        named[values == codes[name]] = name
-    return named, np.asarray(state.steps).reshape(shape)
+def computed_thresholds(settings: ReproduceSettings, exact: xarray.Dataset) -> np.ndarray:
+    """The thresholds by the theory's operator on sampled Jacobians at the stable policies."""
+    problems = _problems(settings, settings.feasible_set)[UNSTABLE : UNSTABLE + len(ORDERS)]
+    stable = exact["M"].sel(regime="unstable").values[:, None]
+    steps = [mean_square_stability(p, M).threshold_estimate for p, M in zip(problems, stable, strict=True)]
+    return HORIZON * np.asarray(steps)
 
 
 # --- the whole -------------------------------------------------------------------------------------------------------
@@ -389,22 +333,30 @@ def reproduce(out: Path, settings: ReproduceSettings, progress: Progress | None 
     results.check_writable(out)
     progress = progress or _silent
     stages = _Stages(out, settings, fresh)
-    runner = _Runner(stack_problems(_problems(settings, settings.feasible_set)))
-    bounded = _Runner(stack_problems(_problems(settings, "simplex")))
+    problems, bounded_problems = _problems(settings, settings.feasible_set), _problems(settings, "simplex")
+
+    def exact_and_repeated() -> xarray.Dataset:
+        return repeated_minimisation(problems, exact_stage(problems, settings, progress), settings)
+
     with ThreadPoolExecutor() as pool:  # side by side: both spend their time in one-core compilation
-        pending = pool.submit(stages.run, "exact_simplex", lambda: exact_stage(settings, "simplex", _silent))
-        exact = stages.run("exact", lambda: exact_stage(settings, settings.feasible_set, progress))
-        exact_bounded = pending.result()
-    runs = stages.run("runs", lambda: run_stage(runner, exact, settings, progress))
-    cure = stages.run("cure", lambda: cure_stage(runner, exact, bounded, exact_bounded, settings, progress))
-    sweep = stages.run("sweep", lambda: sweep_stage(runner, exact, settings, progress))
+        waiting = [
+            pool.submit(stages.run, "exact_simplex", lambda: exact_stage(bounded_problems, settings, _silent))
+            for _ in range(settings.simplex)
+        ]
+        exact = stages.run("exact", exact_and_repeated)
+        exact_bounded = waiting[0].result() if waiting else None
+    lab = _laboratory(settings, problems, exact)
+    bounded = None if exact_bounded is None else _laboratory(settings, bounded_problems, exact_bounded)
+    runs = stages.run("runs", lambda: run_stage(lab, settings, progress))
+    cure = stages.run("cure", lambda: cure_stage(lab, bounded, settings, progress))
+    sweep = stages.run("sweep", lambda: sweep_stage(lab, settings, progress))
     began = time.monotonic()
-    claims = paper_claims.judge(exact, exact_bounded, runs, cure, sweep, as_printed_stage(settings), settings)
+    claims = paper_claims.judge(exact, exact_bounded, runs, cure, sweep, settings)
     results.save_json([claim.as_dict() for claim in claims], out / "claims.json")
     results.save_text(as_markdown(claims, settings.model_dump()), out / "claims.md")
     stages.seconds["claims"] = time.monotonic() - began
     began = time.monotonic()
     files = paper_figures.draw_all(out, exact, runs, cure, sweep, settings)
     stages.seconds["figures"] = time.monotonic() - began
-    names = ("exact.nc", "exact_simplex.nc", "runs.nc", "cure.nc", "sweep.nc", "claims.json", "claims.md")
-    return Outcome([*(out / name for name in names), *files], claims, stages.seconds)
+    data = [out / f"{stage}.nc" for stage in STAGES if stage in stages.seconds]
+    return Outcome([*data, out / "claims.json", out / "claims.md", *files], claims, stages.seconds)

@@ -122,13 +122,14 @@ def figure_cure(cure: xarray.Dataset, sweep: xarray.Dataset, settings: Reproduce
     left.set_title(rf"diminishing step ${settings.step_size:g}\cdot 10/(n+10)$")
     left.set_ylabel(r"$\|M_n - M^{\mathrm{PS}}\|_F^2$")
 
-    for name, style in (("smaller", "-"), ("simplex", (0, (1, 1)))):
+    cures = {"smaller": ("-", "ten times smaller step"), "simplex": ((0, (1, 1)), "same step, simplex")}
+    for name in (name for name in cures if name in cure):
+        style, label = cures[name]
         n = cure[f"step_{name}"].values
         for order, colour in ORDER_COLOURS.items():
             values = cure[name].sel(order=order).values
             middle.plot(n, np.median(values, axis=0), color=colour, linestyle=style)
-    middle.plot([], [], color="#555555", label="ten times smaller step")
-    middle.plot([], [], color="#555555", linestyle=(0, (1, 1)), label="same step, simplex")
+        middle.plot([], [], color="#555555", linestyle=style, label=label)
     _log_axes(middle)
     middle.set_title("constant step, cured (medians)")
     middle.set_ylim(bottom=middle.get_ylim()[0] / 6)

@@ -62,6 +62,10 @@ def band(axes: Axes, x: ArrayLike, low: ArrayLike, middle: ArrayLike, high: Arra
 
 def save_figure(figure: Figure, path: Path) -> list[Path]:
     """Write PNG and SVG beside each other; `path` has no suffix."""
+    engine = figure.get_layout_engine()
+    if engine is not None:  # once for both files: the layout takes longer than the drawing
+        engine.execute(figure)
+        figure.set_layout_engine("none")
     files = []
     for suffix in (".png", ".svg"):
         target = path.with_name(path.name + suffix)

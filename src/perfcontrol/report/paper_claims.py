@@ -15,14 +15,16 @@ FAR_ORDERS = ("descending", "random")
 
 def judge(
     exact: xarray.Dataset,
-    exact_bounded: xarray.Dataset,
+    exact_bounded: xarray.Dataset | None,
     runs: xarray.Dataset,
     cure: xarray.Dataset,
     sweep: xarray.Dataset,
-    printed: dict[str, float],
     settings: ReproduceSettings,
 ) -> list[Claim]:
-    """All claims, in the order in which the paper makes them; then what the paper does not say."""
+    """All claims, in the order in which the paper makes them; then what the paper does not say.
+
+    `exact_bounded` is None where the simplex was not run.
+    """
     return [
         _decays(runs, "stable"),
         _inverse_rate(runs, settings),
@@ -38,9 +40,9 @@ def judge(
         _backward_decay(cure),
         _onset(sweep),
         _smaller_step(cure),
-        _bounded_set(cure),
+        *([] if exact_bounded is None else [_bounded_set(cure)]),
         _stable_is_not_optimal(runs),
-        _as_printed(printed),
+        _as_printed(exact),
     ]
 
 
@@ -217,16 +219,17 @@ def _ascending_survives(runs: xarray.Dataset) -> Claim:
     )
 
 
-def _existence(exact: xarray.Dataset, bounded: xarray.Dataset) -> Claim:
-    residual = max(float(exact["residual"].max()), float(bounded["residual"].max()))
-    unique = bool(exact["unique"].all()) and bool(bounded["unique"].all())
-    spread = max(float(exact["spread"].max()), float(bounded["spread"].max()))
+def _existence(exact: xarray.Dataset, bounded: xarray.Dataset | None) -> Claim:
+    sets = [exact] if bounded is None else [exact, bounded]
+    residual, spread = (max(float(found[name].max()) for found in sets) for name in ("residual", "spread"))
+    unique = all(bool(found["unique"].all()) for found in sets)
+    where = "the feasible set" if bounded is None else "both sets"
     found = residual <= 1e-11 and unique and spread <= 1e-8
     verdict: Verdict = "does not hold" if found else "holds"
     return Claim(
         "Large initial sensitivities rule out the existence of M^PS (unstable regime, descending and random)",
         f"{SECTION}; Proposition 2",
-        "largest relative natural residual of the exact stable policies, all nine cases on both sets",
+        "largest relative natural residual of the exact stable policies, all nine cases on " + where,
         residual,
         (residual, residual),
         "does not hold if every case has a stable policy (residual at most 1e-11), a unique best response, and the "
@@ -369,9 +372,9 @@ def _stable_is_not_optimal(runs: xarray.Dataset) -> Claim:
     )
 
 
-def _as_printed(printed: dict[str, float]) -> Claim:
-    value = printed["largest_variance"]
-    nothing = value < 1e-10 and printed["response_difference"] < 1e-9
+def _as_printed(exact: xarray.Dataset) -> Claim:
+    value, difference = float(exact["printed_variance"]), float(exact["printed_difference"])
+    nothing = value < 1e-10 and difference < 1e-9
     return Claim(
         "With v ~ N(log ε_t, 0.2) clipped to [-0.6, 0.6] the sensitivities ε_t set how the dynamics see the policy",
         "Appendix A, simulation paragraph",
@@ -381,7 +384,7 @@ def _as_printed(printed: dict[str, float]) -> Claim:
         "does not hold if the variance is below 1e-10 and the best response is the same from every deployed policy",
         "does not hold" if nothing else "holds",
         "As printed log ε_t is at most -2, so v is -0.6 on every day: the growth is a constant, the dynamics do not "
-        f"see the policy on the row-sum set, and repeated minimisation ends after {printed['steps_of_rrm']:.0f} steps "
-        f"whatever the start (best responses differ by {printed['response_difference']:.1e}). Read as log-normal, "
+        f"see the policy on the row-sum set, and repeated minimisation ends after {int(exact['printed_steps'])} steps "
+        f"whatever the start (best responses differ by {difference:.1e}). Read as log-normal, "
         "v = clip(exp N(log ε_t, 0.2²), -0.6, 0.6), the experiment means what it says.",
     )
