@@ -118,22 +118,30 @@ def _inverse_rate(runs: xarray.Dataset, settings: ReproduceSettings) -> Claim:
 
 
 def _cost_converges(runs: xarray.Dataset, regime: str, panel: str) -> Claim:
-    values = {}
+    quarter = runs.sizes["step"] // 4
+
+    def drift(rows: np.ndarray) -> float:
+        middle = np.median(rows, axis=0)
+        return abs(np.mean(middle[-quarter:]) - np.mean(middle[-2 * quarter : -quarter])) / np.ptp(middle)
+
+    values, levels = {}, {}
     for order in _orders(runs):
         cost = runs["cost"].sel(regime=regime, order=order).values
-        best = float(runs["stable_cost"].sel(regime=regime, order=order))
-        excess = np.abs(cost - best)
-        values[order] = bootstrap(excess[:, -1] / excess[:, 0], np.median)
+        values[order] = bootstrap(cost, drift)
+        stable = float(runs["stable_cost"].sel(regime=regime, order=order))
+        levels[order] = float(np.mean(np.median(cost, axis=0)[-quarter:])) / stable
     name, value, interval = _worst(values)
     return Claim(
         f"In the {regime} regime the expected total cost converges",
         f"{SECTION}, {panel}",
-        f"median of the final over the initial distance of C_T(M_n; M_n) to C_T(M^PS; M^PS), worst order ({name})",
+        "change of the median C_T(M_n; M_n) from the third to the last quarter of the run, over its whole range, worst "
+        f"order ({name})",
         value,
         interval,
-        "holds as completed if the interval lies below 1",
-        "holds as completed" if interval[1] < 1 else "does not hold",
-        f"Final over initial distance of the cost: {_listed(values)}; completions as in the first row.",
+        "holds as completed if the interval lies below 0.1: the cost has settled",
+        "holds as completed" if interval[1] < 0.1 else "does not hold",
+        f"Changes: {_listed(values)}. Level on which it settles, over C_T(M^PS; M^PS): {_listed(levels)}: a constant "
+        "step leaves a noise floor above the cost of the stable policy. Completions as in the first row.",
     )
 
 
