@@ -1,13 +1,15 @@
 """`python -m benchmarks [--quick] [--out FILE]`: the table of speeds, everything in one process."""
 
 import argparse
+import os
 from pathlib import Path
 
 import jax
 
 jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
 
-from benchmarks import speed  # noqa: E402 - after the precision is set
+from benchmarks import speed  # noqa: E402 - after JAX is configured
 
 parser = argparse.ArgumentParser(description="Speed of gradients, exact evaluation and stable points.")
 parser.add_argument("--quick", action="store_true", help="the small shapes only")

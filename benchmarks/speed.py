@@ -12,6 +12,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
+from jax.sharding import PartitionSpec as P
 
 import perfcontrol as pc
 from benchmarks import numpy_gradients
@@ -23,6 +25,7 @@ from perfcontrol.experiments.batches import in_single_precision
 
 SHAPES = {"(20, 1, 60)": (20, 1, 60), "(4, 10, 200)": (4, 10, 200), "(100, 5, 100)": (100, 5, 100)}  # n = m, H, T
 SEEDS = 288
+LANES = 16  # seeds worked on together: they stay in cache
 Row = tuple[str, str, float, str]
 
 
@@ -73,8 +76,30 @@ def _policy(problem: pc.PerformativeProblem) -> jax.Array:
 
 
 def batch_gradients(problem: pc.PerformativeProblem, M: jax.Array, keys: jax.Array) -> jax.Array:
-    """A sampled path gradient for every key."""
-    return jax.lax.map(lambda key: mean_path_gradient(problem, M, M, key, 1), keys, batch_size=8)
+    """A sampled path gradient for every key, on one core."""
+    return jax.lax.map(lambda key: mean_path_gradient(problem, M, M, key, 1), keys, batch_size=LANES)
+
+
+def gradients_on_all_cores(problem: pc.PerformativeProblem, M: jax.Array, keys: jax.Array) -> jax.Array:
+    """The same, the keys shared out over the host's cores."""
+    mesh = Mesh(np.array(jax.devices()), ("keys",))
+    spread = jax.shard_map(
+        lambda keys: batch_gradients(problem, M, keys), mesh=mesh, in_specs=P("keys"), out_specs=P("keys"),
+        check_vma=False,
+    )  # fmt: skip
+    return spread(keys)
+
+
+def seed_rows(name: str, label: str, problem: pc.PerformativeProblem, M: jax.Array, printed: float) -> list[Row]:
+    """Seconds per seed of `SEEDS`, on one core and on all."""
+    rows: list[Row] = []
+    keys = jax.random.split(jax.random.key(3), SEEDS)
+    for function, where in ((batch_gradients, "one core"), (gradients_on_all_cores, f"{len(jax.devices())} cores")):
+        call, build = compiled(function, problem, M, keys)
+        took = median_time(call) / SEEDS
+        note = f"{printed / took:.0f} (compiled in {build:.1f} s)"
+        rows.append((name, f"ours, the same per seed of {SEEDS}, {label}, {where}", took, note))
+    return rows
 
 
 def numpy_baselines(problem: pc.PerformativeProblem, M: jax.Array) -> tuple[float, float]:
@@ -118,16 +143,7 @@ def gradient_rows(name: str, problem: pc.PerformativeProblem) -> list[Row]:
                 f"{printed / took:.0f} (compiled in {build:.1f} s)",
             )
         )
-        call, build = compiled(batch_gradients, p, policy, jax.random.split(jax.random.key(3), SEEDS))
-        took = median_time(call) / SEEDS
-        rows.append(
-            (
-                name,
-                f"ours, the same per seed of {SEEDS}, {label}",
-                took,
-                f"{printed / took:.0f} (compiled in {build:.1f} s)",
-            )
-        )
+        rows += seed_rows(name, label, p, policy, printed)
     return rows
 
 
@@ -155,6 +171,28 @@ def stable_rows(name: str, problem: pc.PerformativeProblem) -> list[Row]:
     first = time.perf_counter() - began
     took = median_time(lambda: pc.solve(problem, pc.StablePoint()).M)
     return [(name, "StablePoint, compiled", took, f"first call {first:.1f} s")]
+
+
+def sweep_rows(count: int = 20) -> list[Row]:
+    """Problems that differ in a parameter of a policy map: all but the first reuse what was compiled."""
+    base = problem_of(20, 1, 60, "directional")
+    scale = pc.Function(lambda M, p: p * jnp.sqrt(1 + jnp.sum(M**2) / 20) * jnp.ones(2), 0.1)
+    base = eqx.tree_at(lambda p: p.perturbation, base, pc.DirectionalPerturbation(base.perturbation.directions, scale))
+
+    def work(strength: float) -> None:
+        problem = eqx.tree_at(lambda p: p.perturbation.scale.params, base, jnp.asarray(strength))
+        M = pc.solve(problem, pc.StablePoint()).M
+        pc.expected_cost(problem, M).block_until_ready()
+
+    began = time.perf_counter()
+    work(0.1)
+    first = time.perf_counter() - began
+    began = time.perf_counter()
+    for index in range(1, count):
+        work(0.1 + 0.005 * index)
+    rest = time.perf_counter() - began
+    note = f"the first took {first:.1f} s"
+    return [("directional (20, 1, 60)", f"stable point and its cost, {count - 1} further swept problems", rest, note)]
 
 
 def exponent(sizes: list[int], times: list[float]) -> float:
@@ -194,10 +232,12 @@ def machine_rows(best: float) -> list[Row]:
     a = jnp.ones((n, n), jnp.float32)
     product = median_time(compiled(lambda a: a @ a, a)[0])
     flops = 2 * n**3 / product
-    big = jnp.ones(2**25, jnp.float32)
-    moved = median_time(compiled(lambda v: v + 1, big)[0])
+    source, target = np.ones(2**25, np.float32), np.zeros(2**25, np.float32)
+    moved = median_time(lambda: np.copyto(target, source))
     numbers = 2**20
     drawn = median_time(compiled(lambda key: jax.random.uniform(key, (numbers,), jnp.float32), jax.random.key(0))[0])
+    # A dense path draws a sign for every entry of 60 matrices, 32 from one word.
+    share_drawn = f"{100 * 60 * 20 * 20 / 32 * drawn / numbers / best:.0f} % of a dense path's time is words of signs"
     work = 2 * 60 * (2 * 2 * 20 * 20)  # multiply-adds of two matrix products a step, forward and backward
     return [
         (
@@ -207,7 +247,7 @@ def machine_rows(best: float) -> list[Row]:
             f"{100 * work / best / flops:.1f} % used by a dense path per seed",
         ),
         ("machine", f"memory, {2 * 4 * 2**25 / moved / 1e9:.1f} GB/s", moved, ""),
-        ("machine", f"uniform numbers, {1e9 * drawn / numbers:.2f} ns each", drawn, ""),
+        ("machine", f"uniform numbers, {1e9 * drawn / numbers:.2f} ns each", drawn, share_drawn),
     ]
 
 
@@ -222,26 +262,18 @@ def table(quick: bool) -> str:
     stock = pc.experiments.stock_market("random")
     M = _policy(stock)
     dense_best = next(
-        t for case, what, t, _ in rows if case == "dense (20, 1, 60)" and "per seed" in what and "float32" in what
+        t for case, what, t, _ in rows if case == "dense (20, 1, 60)" and what.endswith("float32, one core")
     )
     printed = next(t for case, what, t, _ in rows if case == "dense (20, 1, 60)" and "(a)" in what)
     for label, p in (("float64", stock), ("float32", in_single_precision(stock))):
-        call, build = compiled(batch_gradients, p, M.astype(p.dtype), jax.random.split(jax.random.key(3), SEEDS))
-        took = median_time(call) / SEEDS
-        rows.append(
-            (
-                "stock (20, 1, 60)",
-                f"ours, per seed of {SEEDS}, {label}",
-                took,
-                f"{printed / took:.0f} (compiled in {build:.1f} s)",
-            )
-        )
+        rows += seed_rows("stock (20, 1, 60)", label, p, M.astype(p.dtype), printed)
     for kind in ("dense", "directional"):
         rows += exact_rows(f"{kind} (20, 1, 60)", problem_of(20, 1, 60, kind))
     rows += exact_rows("stock (20, 1, 60)", stock)
     for kind in ("dense", "directional"):
         rows += stable_rows(f"{kind} (20, 1, 60)", problem_of(20, 1, 60, kind))
     rows += stable_rows("stock (20, 1, 60)", stock)
+    rows += sweep_rows()
     rows += scaling_rows()
     rows += machine_rows(dense_best)
     lines = ["| case (n = m, H, T) | what | time | times (a), or else |", "|---|---|--:|---|"]

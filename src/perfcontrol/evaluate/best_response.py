@@ -30,8 +30,8 @@ from perfcontrol.evaluate.exact import (
     cost_to_go,
     exact_gradient,
     impulse_form,
-    mean_path,
     require_moments,
+    sustained_form,
 )
 from perfcontrol.evaluate.rollout import check_pair
 from perfcontrol.problem import PerformativeProblem
@@ -77,20 +77,6 @@ def _gradient_at(problem: PerformativeProblem, world: CostToGo) -> Operator:
     return gradient
 
 
-def _constant_mean_form(problem: PerformativeProblem, world: CostToGo) -> Array:
-    """G̃ (H m, H m): the quadratic form that constant feedforwards ṽ_i from time i on meet."""
-    H, m, n, T = problem.memory, problem.input_size, problem.state_size, problem.horizon
-    active = (jnp.arange(T + 1)[:, None] >= jnp.arange(1, H + 1)).astype(world.S.dtype)  # (T+1, H)
-
-    def row(index: Array) -> Array:
-        v = active @ (jnp.zeros((H * m,), world.S.dtype).at[index].set(1)).reshape(H, m)
-        zero = jnp.zeros(n, world.S.dtype)
-        _, by_v = mean_path(problem, world, v, jnp.zeros((T, n), world.S.dtype), zero, targets=False)
-        return (active.T @ by_v).reshape(-1) / 2
-
-    return symmetrise(jax.vmap(row)(jnp.arange(H * m)))
-
-
 def quadratic(problem: PerformativeProblem, world: CostToGo) -> Quadratic:
     """The quadratic C_T(·; M') of a given world."""
     gradient = _gradient_at(problem, world)
@@ -114,7 +100,7 @@ def _hessian_matrix(problem: PerformativeProblem, world: CostToGo, gradient: Ope
         H, m, _ = problem.lifted_shape
         w = world.noise_mean
         G = impulse_form(world, H).G
-        blocks = jnp.stack([G, _constant_mean_form(problem, world)]).reshape(2, H, m, H, m)
+        blocks = jnp.stack([G, sustained_form(world, H)]).reshape(2, H, m, H, m)
         right = jnp.stack([world.noise_covariance, jnp.outer(w, w)])
 
         def column(direction: Array) -> Array:
@@ -336,7 +322,7 @@ class _Separable:
     def __init__(self, problem: PerformativeProblem, world: CostToGo):
         self.problem, self.world = problem, world
         H, m, n = self.shape = problem.lifted_shape
-        G, G_mean = impulse_form(world, H).G, _constant_mean_form(problem, world)
+        G, G_mean = impulse_form(world, H).G, sustained_form(world, H)
         Sigma, w = world.noise_covariance, world.noise_mean
         eps = jnp.finfo(G.dtype).eps
         G_values, self.G_vectors = jnp.linalg.eigh(G)

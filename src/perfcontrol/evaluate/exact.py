@@ -21,8 +21,11 @@ from perfcontrol._checks import check_finite, fail
 from perfcontrol._linalg import Matrix, along_time, as_dense, congruence, matvec, rmatvec, symmetrise, transpose
 from perfcontrol.costs import QuadraticCost
 from perfcontrol.evaluate.rollout import check_pair, input_adjoint, input_term
+from perfcontrol.perturbations import CovarianceOperator
 from perfcontrol.policy import feedforward, feedforward_adjoint
 from perfcontrol.problem import PerformativeProblem
+
+SIMULATE = "Use pc.estimate_cost and pc.sample_gradient, which only simulate."
 
 
 class CostToGo(eqx.Module):
@@ -30,8 +33,9 @@ class CostToGo(eqx.Module):
 
     Lambda: (T+1, n, n) cost-to-go. S: (T+1, m, m) curvature in the feedforward v_t. D: (T+1, m, n) its coupling to
     the state. R, N: the parts of S and D that are not BᵀΛB and BᵀΛF: stage cost and perturbation of the input; with
-    the axis T+1 where they vary, N None where there is no coupling. F: (T, n, n) mean closed loop. B: (T, n, m) mean
-    input matrix, Θ included. noise_mean: (n,) or (T, n) and noise_covariance: (n, n) or (T, n, n), of the law of w_t.
+    the axis T+1 where they vary, N None where there is no coupling. F: (n, n) mean closed loop, B: (n, m) mean input
+    matrix, Θ included; with the axis T where they vary. noise_mean: (n,) or (T, n) and noise_covariance: (n, n) or
+    (T, n, n), of the law of w_t.
     """
 
     Lambda: Float[Array, "T1 n n"]
@@ -57,25 +61,30 @@ class ImpulseForm(eqx.Module):
 
 
 def require_moments(problem: PerformativeProblem) -> None:
-    """Raise unless cost and perturbation have what exact evaluation needs."""
-    remedy = "Use pc.estimate_cost and pc.sample_gradient, which only simulate."
+    """Raise unless the cost is what exact evaluation needs; of the perturbation, `known_covariance` says."""
     if not isinstance(problem.cost, QuadraticCost):
-        raise fail("cost", type(problem.cost).__name__, "be a QuadraticCost for exact evaluation", remedy)
-    policy = jax.ShapeDtypeStruct(problem.lifted_shape, problem.dtype)
-    if eqx.filter_eval_shape(lambda p, M: p.covariance(M, problem.horizon), problem.perturbation, policy) is None:
+        raise fail("cost", type(problem.cost).__name__, "be a QuadraticCost for exact evaluation", SIMULATE)
+
+
+def known_covariance(problem: PerformativeProblem, reacting: Array) -> CovarianceOperator:
+    """The covariance operator of the perturbation; raises where the law does not know it."""
+    spread = problem.perturbation.covariance(reacting, problem.horizon)
+    if spread is None:
         raise fail(
             "perturbation",
             f"{type(problem.perturbation).__name__} without known moments",
             "know its mean and covariance for exact evaluation",
-            remedy,
+            SIMULATE,
         )
+    return spread
 
 
 def mean_dynamics(problem: PerformativeProblem, reacting: Array) -> tuple[Array, Array]:
     """[A_t, B_t] + Θ_t, (T, n, n+m), and the matrix [[I, 0], [-K_t, I]] from [x; v] to [x; u], (T+1, n+m, n+m)."""
     n, m, T = problem.state_size, problem.input_size, problem.horizon
+    known_covariance(problem, reacting)
     Theta = problem.perturbation.mean(reacting, T)
-    assert Theta is not None
+    assert Theta is not None  # where the covariance is known, so is the mean
     A, B = as_dense(problem.system.A), as_dense(problem.system.B)
     joint = jnp.concatenate([along_time(A, 2, T), along_time(B, 2, T)], axis=-1)
     joint = joint.at[..., : Theta.shape[-1]].add(Theta)
@@ -114,22 +123,28 @@ def cost_to_go(problem: PerformativeProblem, reacting: Array) -> CostToGo:
         A, B = A + joint[..., :n], B + joint[..., n:]
     elif Theta is not None:
         A = A + Theta
-    F, B = along_time(problem.closed_loop(A, B), 2, T), along_time(B, 2, T)
-    spread = problem.perturbation.covariance(reacting, T)
-    assert spread is not None
+    F = problem.closed_loop(A, B)
+    varying = F.ndim == 3
+    spread = known_covariance(problem, reacting)
     K = problem.gains()[:-1]
     state_part = jnp.concatenate([jnp.broadcast_to(jnp.eye(n, dtype=K.dtype), (T, n, n)), -K], axis=1)
 
+    spread_steps, backward = (spread.steps, None) if varying or on_input else spread.backward(F)
+
     def retreat(Lambda: Array, step: Any) -> tuple[Array, Array]:
         F_t, stage_t, spread_t, state_part_t = step
-        reaction = spread.adjoint_step(spread_t, Lambda)
-        if on_input:
-            reaction = congruence(state_part_t, reaction)
-        previous = (on_x if stage_t is None else stage_t) + congruence(F_t, Lambda) + reaction
+        if backward is not None:
+            moved = backward(spread_t, Lambda)
+        else:
+            reaction = spread.adjoint_step(spread_t, Lambda)
+            moved = congruence(F_t if varying else F, Lambda)
+            moved = moved + (congruence(state_part_t, reaction) if on_input else reaction)
+        previous = (on_x if stage_t is None else stage_t) + moved
         return previous, previous
 
     last = symmetrise(on_x if on_x.ndim == 2 else on_x[-1])
-    steps = (F, on_x[:-1] if on_x.ndim == 3 else None, spread.steps, state_part if on_input else None)
+    stages = on_x[:-1] if on_x.ndim == 3 else None
+    steps = (F if varying else None, stages, spread_steps, state_part if on_input else None)
     _, earlier = jax.lax.scan(retreat, last, steps, reverse=True)
     Lambda = jnp.concatenate([earlier, last[None]])
     if on_input:
@@ -138,7 +153,7 @@ def cost_to_go(problem: PerformativeProblem, reacting: Array) -> CostToGo:
         on_v = on_v + jnp.pad(reaction[:, :, n:], last_stage)
         between = jnp.pad(reaction @ state_part, last_stage) + (0 if between is None else between)
     # What couples to v needs no recursion: in bulk over time.
-    pulled = transpose(B) @ Lambda[1:]
+    pulled = transpose(Lambda[1:] @ B)
 
     def with_stage(stage: Array | None, moved: Array) -> Array:
         if stage is None:
@@ -164,7 +179,7 @@ def _chains(world: CostToGo, memory: int) -> tuple[list[Array], list[Array]]:
         def shift(array: Array) -> Array:
             return jnp.concatenate([jnp.zeros((d, *array.shape[1:]), array.dtype), array])[:length]
 
-        return jax.tree.map(shift, matrices)
+        return jax.tree.map(shift, along_time(matrices, 2, length - 1))
 
     Y, X = [world.D], [world.S]
     for d in range(1, memory):
@@ -173,20 +188,62 @@ def _chains(world: CostToGo, memory: int) -> tuple[list[Array], list[Array]]:
     return Y, X
 
 
+def tail_sums(matrices: Array, memory: int, length: int) -> Array:
+    """Σ_{t ≥ j} of matrices_t for j = 1..memory, t up to length - 1; without a time axis, the same at every t."""
+    if matrices.ndim == 2:
+        return jnp.arange(length - 1, length - 1 - memory, -1, dtype=matrices.dtype)[:, None, None] * matrices
+    parts = jnp.concatenate([matrices[1:memory], jnp.sum(matrices[memory:], axis=0)[None]])
+    return jnp.flip(jnp.cumsum(jnp.flip(parts, axis=0), axis=0), axis=0)
+
+
+def _chain_tails(world: CostToGo, memory: int) -> tuple[Array, Array]:
+    """Σ_{t ≥ j} X[d]_t at index [d, j-1], (H, H, m, m), and Σ_{t > d} Y[d]_t, (H, m, n)."""
+    length = world.S.shape[0]
+    if world.F.ndim == 3 or world.B.ndim == 3:
+        Y, X = _chains(world, memory)
+        # Y[d]_t is zero for t < d, and t = d would be the impulse w_{-1}.
+        over_time = jnp.stack([jnp.sum(y[d + 1 :], axis=0) for d, y in enumerate(Y)])
+        return jnp.stack([tail_sums(x, memory, length) for x in X]), over_time
+    # The same matrices at every time: the sums come first, and nothing but Λ needs a pass over time.
+    F, B = as_dense(world.F), as_dense(world.B)
+    pulled = transpose(B) @ tail_sums(world.Lambda[1:], memory, length - 1)
+    curvature = pulled @ B + tail_sums(world.R, memory, length)
+    coupling = pulled @ F if world.N is None else pulled @ F + tail_sums(world.N, memory, length)
+    Y, X = [coupling], [curvature]
+    for _ in range(1, memory):
+        X.append(Y[-1] @ B)
+        Y.append(Y[-1] @ F)
+    return jnp.stack(X), jnp.stack([y[d] for d, y in enumerate(Y)])
+
+
 def impulse_form(world: CostToGo, memory: int) -> ImpulseForm:
-    """The blocks summed over impulses, by suffix sums over time."""
+    """The blocks summed over impulses, by tail sums over time."""
     m = world.S.shape[-1]
-    Y, X = _chains(world, memory)
-    # Σ_{t ≥ j} X[d]_t at index [d, j], for j = 0..memory
-    head = jnp.stack([jnp.concatenate([x[:memory], jnp.sum(x[memory:], axis=0)[None]]) for x in X])
-    later = jnp.flip(jnp.cumsum(jnp.flip(head, axis=1), axis=1), axis=1)
+    X, Y = _chain_tails(world, memory)
     row, column = jnp.meshgrid(jnp.arange(memory), jnp.arange(memory), indexing="ij")
-    blocks = later[jnp.abs(row - column), jnp.maximum(row, column) + 1]
+    blocks = X[jnp.abs(row - column), jnp.maximum(row, column)]
     blocks = jnp.where((row >= column)[..., None, None], blocks, transpose(blocks))
     G = blocks.transpose(0, 2, 1, 3).reshape(memory * m, memory * m)
-    # Y[d]_t is zero for t < d, and t = d would be the impulse w_{-1}.
-    F = jnp.concatenate([jnp.sum(y[d + 1 :], axis=0) for d, y in enumerate(Y)])
-    return ImpulseForm(G, F, jnp.sum(world.Lambda[1:], axis=0))
+    return ImpulseForm(G, Y.reshape(memory * m, -1), jnp.sum(world.Lambda[1:], axis=0))
+
+
+def sustained_form(world: CostToGo, memory: int) -> Array:
+    """(H m, H m): the quadratic form that constant feedforwards ṽ_i, held from time i on, meet (i = 1..H)."""
+    length, m = world.S.shape[0], world.S.shape[-1]
+    active = (jnp.arange(length)[:, None] >= jnp.arange(1, memory + 1)).astype(world.S.dtype)  # (T+1, H)
+    B = as_dense(along_time(world.B, 2, length - 1))
+    push = (B[:, :, None, :] * active[:-1, None, :, None]).reshape(length - 1, B.shape[1], memory * m)
+    varying = world.F.ndim == 3
+
+    def advance(X: Array, step: Any) -> tuple[Array, Array]:
+        F_t, push_t = step
+        return (F_t if varying else world.F) @ X + push_t, X
+
+    last, X = jax.lax.scan(advance, jnp.zeros_like(push[0]), (world.F if varying else None, push))
+    states = jnp.concatenate([X, last[None]])  # X_t: the state that the columns of ṽ have led to
+    coupled = tail_sums(world.D @ states, memory, length).reshape(memory * m, memory * m)
+    held = tail_sums(world.S, memory, length)[jnp.maximum(*jnp.indices((memory, memory)))]
+    return coupled + coupled.T + held.transpose(0, 2, 1, 3).reshape(memory * m, memory * m)
 
 
 def _varying_impulses(world: CostToGo, M: Array, covariance: Array) -> tuple[Array, Array]:
@@ -223,9 +280,7 @@ def _constant_impulses(world: CostToGo, M: Array, covariance: Array) -> tuple[Ar
     return cost, (2 * (form.F + curved) @ covariance).reshape(M.shape)
 
 
-def mean_path(
-    problem: PerformativeProblem, world: CostToGo, v: Array, w: Array, x0: Array, targets: bool = True
-) -> tuple[Array, Array]:
+def mean_path(problem: PerformativeProblem, world: CostToGo, v: Array, w: Array, x0: Array) -> tuple[Array, Array]:
     """Expected cost of the deterministic part v (T+1, m), w (T, n), x_0, and its gradient by v, (T+1, m).
 
     The multiplicative noise that the mean path excites is included: Λ carries it.
@@ -236,33 +291,36 @@ def mean_path(
     push = input_term(world.B, v) + w
     moved = matvec(world.Lambda[1:], push)
     source, by_input_stage, constant = jnp.zeros((T + 1, n), v.dtype), 0, 0
-    if targets and cost.has_targets:
+    if cost.has_targets:
         linear, constant = cost.linear_terms(T)
         by_input_stage = linear[:, n:]
         source = linear[:, :n] - problem.feedback_adjoint(by_input_stage)
     if world.N is not None:
-        source = source + rmatvec(world.N, v)
+        source = source + (v @ world.N if world.N.ndim == 2 else rmatvec(world.N, v))
+    varying = world.F.ndim == 3
+    F = world.F if varying else None
 
     def retreat(p: Array, step: Any) -> tuple[Array, Array]:
         F_t, source_t, moved_t = step
-        return source_t + rmatvec(F_t, moved_t + p), p
+        return source_t + rmatvec(F_t if varying else world.F, moved_t + p), p
 
-    p0, p_next = jax.lax.scan(retreat, source[-1], (world.F, source[:-1], moved), reverse=True)
+    p0, p_next = jax.lax.scan(retreat, source[-1], (F, source[:-1], moved), reverse=True)
 
     def advance(mu: Array, step: Any) -> tuple[Array, Array]:
         F_t, push_t = step
-        following = matvec(F_t, mu) + push_t
+        following = matvec(F_t if varying else world.F, mu) + push_t
         return following, following
 
-    _, mu = jax.lax.scan(advance, x0, (world.F, push))
+    _, mu = jax.lax.scan(advance, x0, (F, push))
     # x' Λ x + 2 p' x is what lies ahead: each push adds its own to it, and by_v is what it adds at the margin.
     total = x0 @ (world.Lambda[0] @ x0 + 2 * p0) + jnp.sum(push * (moved + 2 * p_next)) + jnp.sum(constant)
-    weighed = matvec(world.R, v)
+    weighed = v @ world.R if world.R.ndim == 2 else matvec(world.R, v)
     total = total + jnp.sum(v * (weighed + 2 * by_input_stage))
     margin = input_adjoint(world.B, matvec(world.Lambda[1:], mu) + p_next)
     by_v = weighed + by_input_stage + jnp.pad(margin, ((0, 1), (0, 0)))
     if world.N is not None:
-        by_v = by_v + matvec(world.N, jnp.concatenate([x0[None], mu]))
+        states = jnp.concatenate([x0[None], mu])
+        by_v = by_v + (states @ world.N.T if world.N.ndim == 2 else matvec(world.N, states))
     return total, 2 * by_v
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from perfcontrol._checks import check_finite
 from perfcontrol._linalg import along_time, symmetrise
-from perfcontrol.evaluate.exact import mean_dynamics, require_moments
+from perfcontrol.evaluate.exact import known_covariance, mean_dynamics, require_moments
 from perfcontrol.evaluate.rollout import check_pair
 from perfcontrol.policy import lagged
 from perfcontrol.problem import PerformativeProblem
@@ -39,8 +39,7 @@ def moments_of(problem: PerformativeProblem, policy: Array, reacting: Array) -> 
     """The forward recursion for lifted policies; pure."""
     n, m, H, T = problem.state_size, problem.input_size, problem.memory, problem.horizon
     joint, through_gain = mean_dynamics(problem, reacting)
-    spread = problem.perturbation.covariance(reacting, T)
-    assert spread is not None
+    spread = known_covariance(problem, reacting)
     columns = problem.perturbation.columns(n, m)
     noise = problem.noise_under(reacting)
     w = along_time(noise.mean, 1, T)

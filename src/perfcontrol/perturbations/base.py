@@ -5,6 +5,7 @@ time loop carries only the former: loops call `*_step(step, ...)`, bulk code the
 """
 
 import abc
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -12,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
-from perfcontrol._linalg import Matrix, matvec, rmatvec
+from perfcontrol._linalg import Matrix, matvec, rmatvec, transpose
 
 
 class Draws(eqx.Module):
@@ -78,6 +79,11 @@ class CovarianceOperator(eqx.Module):
     @abc.abstractmethod
     def adjoint_step(self, step: Any, X: Float[Array, "n n"]) -> Float[Array, "p p"]:
         """E[(Δ-Θ)ᵀ X (Δ-Θ)] at one time."""
+
+    def backward(self, F: Matrix) -> tuple[Any, Callable[[Any, Array], Array]]:
+        """Steps, and (step, X) -> FᵀXF + `adjoint_step`: for a loop over time in which F (n, n) stays the same."""
+        left = transpose(F)  # outside the loop, where it is done once
+        return self.steps, lambda step, X: left @ X @ F + self.adjoint_step(step, X)
 
     def apply(self, X: Array) -> Float[Array, "T n n"]:
         """`apply_step` for every t, X of shape (p, p) or (T, p, p)."""

@@ -1,5 +1,6 @@
 """Random multiples of fixed directions: Δ_t = mean(M)[t] + Σ_k scale(M)[t, k] ζ_{t,k} directions[k]."""
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -7,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Key
 
 from perfcontrol._checks import as_array, fail
-from perfcontrol._linalg import matvec, rmatvec
+from perfcontrol._linalg import Matrix, as_dense, matvec, rmatvec
 from perfcontrol.perturbations.base import AbstractPerturbation, CovarianceOperator, Draws, zero_mean
 from perfcontrol.perturbations.dependence import check_values, largest_entries, matrix_slope_norm, slopes
 from perfcontrol.perturbations.scalar_laws import SCALAR_LAWS
@@ -53,6 +54,18 @@ class DirectionalCovariance(CovarianceOperator):
 
     def adjoint_step(self, step: Any, X: Array) -> Array:
         return jnp.einsum("k,kba,bc,kcd->ad", step, self.directions, X, self.directions, optimize="optimal")
+
+    def backward(self, F: Matrix) -> tuple[Any, Callable[[Any, Array], Array]]:
+        # F beside the directions: two products a step, however many directions; all transposing is done here, once.
+        stack = jnp.concatenate([as_dense(F)[None], self.directions])
+        count, n, _ = stack.shape
+        wide, tall = stack.transpose(1, 0, 2).reshape(n, count * n), stack.reshape(count * n, n).T
+
+        def step_back(weights: Any, X: Array) -> Array:
+            products = (X @ wide).reshape(n, count, n) * weights[:, None]
+            return tall @ products.transpose(1, 0, 2).reshape(count * n, n)
+
+        return jnp.pad(self.variances, ((0, 0), (1, 0)), constant_values=1), step_back
 
 
 class DirectionalPerturbation(AbstractPerturbation):
