@@ -20,12 +20,11 @@ from benchmarks import numpy_gradients
 from perfcontrol.evaluate.adjoint import mean_path_gradient, path_gradient
 from perfcontrol.evaluate.exact import cost_and_gradient, cost_to_go, exact_cost
 from perfcontrol.evaluate.moments import cost_by_moments
-from perfcontrol.evaluate.rollout import sample_path
+from perfcontrol.evaluate.rollout import lanes, sample_path
 from perfcontrol.experiments.batches import in_single_precision
 
 SHAPES = {"(20, 1, 60)": (20, 1, 60), "(4, 10, 200)": (4, 10, 200), "(100, 5, 100)": (100, 5, 100)}  # n = m, H, T
 SEEDS = 288
-LANES = 16  # seeds worked on together: they stay in cache
 Row = tuple[str, str, float, str]
 
 
@@ -77,7 +76,7 @@ def _policy(problem: pc.PerformativeProblem) -> jax.Array:
 
 def batch_gradients(problem: pc.PerformativeProblem, M: jax.Array, keys: jax.Array) -> jax.Array:
     """A sampled path gradient for every key, on one core."""
-    return jax.lax.map(lambda key: mean_path_gradient(problem, M, M, key, 1), keys, batch_size=LANES)
+    return jax.lax.map(lambda key: mean_path_gradient(problem, M, M, key, 1), keys, batch_size=lanes(problem))
 
 
 def gradients_on_all_cores(problem: pc.PerformativeProblem, M: jax.Array, keys: jax.Array) -> jax.Array:

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Key
 
 from perfcontrol._checks import check_integer, check_key
 from perfcontrol._linalg import rmatvec
-from perfcontrol.evaluate.rollout import BATCH, Path, Trajectories, check_pair, input_adjoint, input_term, sample_path
+from perfcontrol.evaluate.rollout import Path, Trajectories, check_pair, input_adjoint, input_term, lanes, sample_path
 from perfcontrol.policy import feedforward_adjoint
 from perfcontrol.problem import PerformativeProblem
 
@@ -84,7 +84,7 @@ def mean_path_gradient(
 
     if samples == 1:
         return one(jnp.zeros((), int))
-    return jnp.mean(jax.lax.map(one, jnp.arange(samples), batch_size=min(BATCH, samples)), axis=0)
+    return jnp.mean(jax.lax.map(one, jnp.arange(samples), batch_size=min(lanes(problem), samples)), axis=0)
 
 
 _compiled_mean_path_gradient = eqx.filter_jit(mean_path_gradient)

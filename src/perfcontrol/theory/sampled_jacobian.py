@@ -13,23 +13,21 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Key
 
-from perfcontrol.evaluate.adjoint import path_gradient
-from perfcontrol.evaluate.rollout import sample_path
+from perfcontrol.evaluate.adjoint import mean_path_gradient
+from perfcontrol.evaluate.rollout import lanes
 from perfcontrol.problem import PerformativeProblem
 
 DENSE_ENTRIES = 20_000_000  # samples × q² that are held at once
-BATCH = 8
 
 
 def _gradient(problem: PerformativeProblem, M: Array, key: Key[Array, ""]) -> Array:
-    policy = problem.structure.lift(M)
-    return path_gradient(problem, sample_path(problem, policy, policy, key))
+    return mean_path_gradient(problem, M, M, key, 1)
 
 
 @eqx.filter_jit
 def sample_gradients(problem: PerformativeProblem, M: Array, keys: Array) -> Array:
     """(S, p): sample gradients at M with M deployed."""
-    return jax.lax.map(lambda key: _gradient(problem, M, key).reshape(-1), keys, batch_size=BATCH)
+    return jax.lax.map(lambda key: _gradient(problem, M, key).reshape(-1), keys, batch_size=lanes(problem))
 
 
 @eqx.filter_jit
@@ -60,7 +58,7 @@ def _products(
             image = jax.jvp(gradient, (M,), (direction,))[1]
         return image.reshape(-1) @ basis
 
-    return jax.lax.map(one, (keys, vectors), batch_size=BATCH)
+    return jax.lax.map(one, (keys, vectors), batch_size=lanes(problem))
 
 
 class JacobianSamples:
