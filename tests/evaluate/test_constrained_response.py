@@ -1,10 +1,14 @@
 """Best responses on sets against CVXPY on the quadratic that NumPy enumerates."""
 
 import cvxpy as cp
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.optimize
 
 import perfcontrol as pc
+from perfcontrol.evaluate.best_response import Quadratic, _Projected
 from tests.oracles.enumeration import enumerate_cost
 from tests.tools import assert_close, normal
 
@@ -107,3 +111,43 @@ def test_best_response_matches_cvxpy_on_the_enumerated_quadratic(name, enumerate
     assert_close(response, np.stack([lag.value for lag in M]), 1e-5)
     free = np.linalg.solve(hessian, -linear).reshape(SHAPE)
     assert np.linalg.norm(free - np.asarray(response)) > 1e-3, "the constraint does not bind"
+
+
+@jax.jit
+def _minimise(quadratic_form, linear, ball):
+    """The engine's minimiser of <N, form N>/2 + <linear, N> on a ball, six free parameters."""
+    problem = pc.PerformativeProblem(
+        system=pc.LinearSystem(np.eye(3), np.ones((3, 2))),
+        horizon=2,
+        noise=pc.Rademacher(np.ones(3)),
+        cost=pc.QuadraticCost(np.eye(3), np.eye(2)),
+        feasible_set=ball,
+    )
+    linear = linear.reshape(problem.policy_shape)
+    step = 1 / jnp.linalg.norm(quadratic_form, 2)
+
+    def gradient(M):
+        return linear + (quadratic_form @ M.reshape(-1)).reshape(M.shape)
+
+    M, unique = _Projected(problem, Quadratic(linear, gradient, step, quadratic_form)).minimise(jnp.zeros_like(linear))
+    return M.reshape(-1), unique
+
+
+def test_projected_response_matches_the_secular_equation_when_the_ball_is_barely_active():
+    """Ill-conditioned quadratics whose minimiser lies just outside the ball: Newton starts on the wrong face."""
+    for seed in range(200):
+        r = np.random.default_rng(seed)
+        vectors, _ = np.linalg.qr(r.standard_normal((6, 6)))
+        values = np.geomspace(1, 10 ** r.uniform(1, 4), 6)
+        free = r.standard_normal(6)
+        radius = np.linalg.norm(free) * (1 - 10 ** r.uniform(-6, -1))
+        linear = -vectors @ (values * (vectors.T @ free))
+
+        def excess(multiplier, values=values, vectors=vectors, linear=linear, radius=radius):
+            return np.linalg.norm((vectors.T @ linear) / (values + multiplier)) - radius
+
+        multiplier = scipy.optimize.brentq(excess, 0, 1e6, xtol=1e-15, rtol=1e-15)
+        expected = -vectors @ ((vectors.T @ linear) / (values + multiplier))
+        found, unique = _minimise(vectors @ np.diag(values) @ vectors.T, linear, pc.FrobeniusBall(radius))
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9 * radius, err_msg=str(seed))
+        assert bool(unique)

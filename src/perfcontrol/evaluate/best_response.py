@@ -241,18 +241,34 @@ class _Projected:
         return self.eye - slope @ (self.eye - self.step * self.form.matrix)
 
     def minimise(self, start: Array) -> tuple[Array, Array]:
-        form = self.form
         eps = float(jnp.finfo(start.dtype).eps)
-        dense = form.matrix is not None
-        M = self._accelerated(
-            self.project(start), *((1e-5, ACCELERATED_STEPS) if dense else (40 * eps, 50 * ACCELERATED_STEPS))
-        )
-        if not dense:
-            return M, jnp.asarray(True)
+        if self.form.matrix is None:
+            return self._accelerated(self.project(start), 40 * eps, 50 * ACCELERATED_STEPS), jnp.asarray(True)
+
+        def unsolved(carry: Any) -> Array:
+            M, gap, *_, tolerance = carry
+            return (gap > 4 * eps * self._scale(M)) & (tolerance > eps)
+
+        def approach(carry: Any) -> Any:
+            # Newton may stall on the wrong face, from where no step of its own helps: then gradient steps again.
+            M, *_, tolerance = carry
+            M, gap, slope = self._newton_steps(self._accelerated(M, tolerance, ACCELERATED_STEPS))
+            return M, gap, slope, 1e-3 * tolerance
+
+        far = jnp.asarray(jnp.inf, start.dtype)
+        first = (self.project(start), far, self.eye, jnp.asarray(1e-5, start.dtype))
+        M, _, slope, _ = jax.lax.while_loop(unsolved, approach, first)
+        # On the active face the Hessian must be definite: the Jacobian has full rank.
+        values = jnp.linalg.eigvalsh(slope @ slope.T)
+        return M, values[0] > (M.size * eps * 100) ** 2 * jnp.maximum(values[-1], 1)
+
+    def _newton_steps(self, M: Array) -> tuple[Array, Array, Array]:
+        """Semismooth Newton steps while they help, the natural residual that they reach, its Jacobian."""
+        eps = float(jnp.finfo(M.dtype).eps)
 
         def improve(carry: Any) -> Any:
             M, gap, count, *_ = carry
-            fallback = self.project(M - self.step * form.gradient(M))
+            fallback = self.project(M - self.step * self.form.gradient(M))
             # The small shift keeps a singular Jacobian (a minimiser that is not unique) solvable.
             slope = self.jacobian(M)
             right = self.residual(M).reshape(-1)
@@ -269,20 +285,18 @@ class _Projected:
                 slope,
             )
 
-        def unsolved(carry: Any) -> Array:
+        def helping(carry: Any) -> Array:
             M, gap, count, stuck, _ = carry
             return (count == 0) | ((gap > 4 * eps * self._scale(M)) & (count < NEWTON_STEPS) & ~stuck)
 
         first = (M, frobenius(self.residual(M)), jnp.asarray(0), jnp.asarray(False), self.eye)
-        M, *_, slope = jax.lax.while_loop(unsolved, improve, first)
-        # On the active face the Hessian must be definite: the Jacobian has full rank.
-        values = jnp.linalg.eigvalsh(slope @ slope.T)
-        return M, values[0] > (M.size * eps * 100) ** 2 * jnp.maximum(values[-1], 1)
+        M, gap, *_, slope = jax.lax.while_loop(helping, improve, first)
+        return M, gap, slope
 
     def _scale(self, M: Array) -> Array:
         return frobenius(M) + self.step * frobenius(self.form.linear) + jnp.finfo(M.dtype).tiny
 
-    def _accelerated(self, start: Array, tolerance: float, limit: int) -> Array:
+    def _accelerated(self, start: Array, tolerance: Any, limit: int) -> Array:
         """Projected gradient steps with momentum, restarted when it points uphill."""
 
         def accelerate(carry: Any) -> Any:

@@ -1,5 +1,6 @@
 """Which policy: the solver loop and the methods, one a file."""
 
+from perfcontrol.solvers.continuation import Continuation
 from perfcontrol.solvers.gradients import Exact, Pathwise
 from perfcontrol.solvers.loop import AbstractSolver, Solution, SolveError, solve
 from perfcontrol.solvers.result import Result
@@ -13,6 +14,7 @@ __all__ = [
     "RRM",
     "RSGD",
     "AbstractSolver",
+    "Continuation",
     "Exact",
     "Greedy",
     "InverseStep",
