@@ -81,8 +81,11 @@ imports: $(DEV_READY) ## Check that imports go downward only
 PYTEST   := $(BIN)/python -m pytest
 # One file, one worker: what a file compiles is compiled once.
 CHECKED  := -n $(WORKERS) --dist loadfile --jaxtyping-packages=perfcontrol,beartype.beartype
-FLOAT64  := JAX_ENABLE_X64=1 PERFCONTROL_TEST_X64=1
-FLOAT32  := JAX_ENABLE_X64=0 PERFCONTROL_TEST_X64=0
+# Compiled programs are kept: a second run takes a third of the time of the first.
+CACHE    := JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.jax_cache JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0 \
+            JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES=-1
+FLOAT64  := $(CACHE) JAX_ENABLE_X64=1 PERFCONTROL_TEST_X64=1
+FLOAT32  := $(CACHE) JAX_ENABLE_X64=0 PERFCONTROL_TEST_X64=0
 
 .PHONY: doctest
 doctest: $(DEV_READY) ## Run the examples in the docstrings
@@ -112,7 +115,7 @@ bench: $(DEV_READY) ## Run the benchmarks (options: ARGS="...")
 
 .PHONY: clean
 clean: ## Remove caches and built files; keep .venv and results/
-	rm -rf build dist site .pytest_cache .ruff_cache .hypothesis .import_linter_cache
+	rm -rf build dist site .jax_cache .pytest_cache .ruff_cache .hypothesis .import_linter_cache
 	find src tests benchmarks docs examples -name __pycache__ -type d -prune -exec rm -rf {} + 2>/dev/null || true
 
 .PHONY: distclean

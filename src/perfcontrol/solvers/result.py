@@ -17,6 +17,6 @@ class Result(eqx.Enumeration):
         "the problem's scales."
     )
     not_converged = (
-        "The tolerance was not reached. The map may have no fixed point, or repeated minimisation does not "
-        "contract: try pc.StablePoint, another M0, or a larger tolerance."
+        "The tolerance was not reached. The map may have no fixed point, or the method starts too far from one: try "
+        "pc.StablePoint where repeated minimisation was used, another M0, pc.Continuation, or a larger tolerance."
     )

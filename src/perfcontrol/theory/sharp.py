@@ -19,9 +19,9 @@ from perfcontrol._checks import InputError, check_integer, fail
 from perfcontrol.evaluate.best_response import respond
 from perfcontrol.evaluate.exact import expected_gradient, require_moments
 from perfcontrol.problem import PerformativeProblem
-from perfcontrol.solvers import Result, Solution, StablePoint, solve
+from perfcontrol.solvers import AbstractSolver, Continuation, Result, Solution, StablePoint, solve
 from perfcontrol.theory.certificate import Assumption, Certificate, not_applicable
-from perfcontrol.theory.existence import existence
+from perfcontrol.theory.existence import existence, set_radius
 from perfcontrol.theory.local import (
     DENSE_LIMIT,
     check_problem,
@@ -35,6 +35,7 @@ from perfcontrol.theory.mean_square import MeanSquareStability, mean_field_thres
 
 JACOBIAN_SAMPLES = 512
 SAFETY = 0.25
+CONTINUED = 256  # free parameters up to which a stable policy is also looked for by continuation
 AFFINE_TOLERANCE = 1e-9
 
 
@@ -103,15 +104,20 @@ def largest_mean_step(model: LocalModel) -> float:
 
 
 def find_stable_policy(problem: PerformativeProblem, starts: int = 3) -> Solution:
-    """The exact solver from the policy nearest to zero, then from random starts until one succeeds."""
-    solution = solve(problem, StablePoint(), throw=False)
-    for seed in range(1, starts):
-        if solution.result == Result.success:
-            break
-        draw = jax.random.normal(jax.random.key(seed), problem.policy_shape, problem.dtype)
-        start = problem.feasible_set.project(problem.initial_policy() + draw)
-        other = solve(problem, StablePoint(), start, throw=False)
-        solution = other if other.result == Result.success else solution
+    """The exact solver from the policy nearest to zero, then from random ones; on a bounded set then continuation."""
+    draws = jax.random.normal(jax.random.key(1), (starts - 1, *problem.policy_shape), problem.dtype)
+    centre, project = problem.initial_policy(), problem.feasible_set.project
+    attempts: list[tuple[AbstractSolver, Array]] = [(StablePoint(), centre)]
+    attempts += [(StablePoint(), project(centre + draw)) for draw in draws]
+    if set_radius(problem) is not None and centre.size <= CONTINUED:
+        attempts.append((Continuation(), centre))
+    solution = None
+    for solver, start in attempts:
+        other = solve(problem, solver, start, throw=False)
+        if other.result == Result.success:
+            return other
+        solution = solution or other
+    assert solution is not None
     return solution
 
 
