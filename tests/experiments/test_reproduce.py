@@ -81,7 +81,7 @@ def test_without_the_simplex_its_claim_and_its_curve_are_left_out(done: tuple[Pa
     missing = {claim.claim for claim in done[1].claims} - {claim.claim for claim in claims}
     assert len(missing) == 1
     assert "simplex" in missing.pop()
-    assert paper_figures.draw_all(tmp_path, exact, runs, cure, sweep, SETTINGS)
+    assert paper_figures.figure_cure(cure, sweep, SETTINGS, tmp_path / "cure")
 
 
 @pytest.mark.slow
