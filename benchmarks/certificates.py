@@ -105,8 +105,8 @@ def survey(count: int) -> list[str]:
         else:
             disagreements.append((index, shape, sharp.rate))
     lines = [
-        "| certificate | holds | median bound / exact rate | smallest | largest |",
-        "| --- | --- | --- | --- | --- |",
+        "| certificate | applicable | holds | median bound / exact rate | smallest | largest |",
+        "| --- | --- | --- | --- | --- | --- |",
     ]
     for name in KINDS:
         spread = ratios[name]

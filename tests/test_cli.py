@@ -24,6 +24,7 @@ def test_help_lists_the_options() -> None:
         (["--steps", "many"], "steps"),
         (["--feasible-set", "cube"], "feasible"),
         (["--step-size", "-1"], "step-size"),
+        (["--rate", "nan"], "rate"),
     ],
 )
 def test_bad_option_exits_with_status_two_and_names_it(arguments: list[str], message: str, tmp_path: Path) -> None:

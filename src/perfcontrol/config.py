@@ -14,7 +14,7 @@ class ReproduceSettings(BaseModel):
     `perfcontrol.experiments.stock`.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     seeds: int = Field(default=32, ge=2, description="independent runs of each case")
     steps: int = Field(default=1000, ge=100, description="iterations N of each run")
