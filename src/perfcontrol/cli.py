@@ -27,7 +27,7 @@ def _configure_jax() -> None:
 
     jax.config.update("jax_enable_x64", True)
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    if "XLA_FLAGS" not in os.environ:
+    if "host_platform_device_count" not in os.environ.get("XLA_FLAGS", ""):
         with contextlib.suppress(RuntimeError):  # JAX runs already, called from a program of its own: keep its devices
             jax.config.update("jax_num_cpu_devices", cores)
 
