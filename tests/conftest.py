@@ -26,27 +26,6 @@ SLOW = (
     "test_intersection.py::test_intersection_projection_differentiates_in_the_parameters_of_its_sets",
     "test_properties.py::test_single_precision_answers_like_double_precision",
     "test_stock.py::test_stable_policy_is_where_repeated_minimisation_goes_in_all_nine_cases[simplex]",
-    # What these show is shown by quicker tests as well, for another family or in a smaller case.
-    "test_intersection.py::TestSpectralBallBoxAndRowSum",
-    "test_intersection.py::TestRowSumAndBox",
-    "test_intersection.py::test_intersection_projection_satisfies_its_variational_inequality_far_outside[30.0]",
-    "test_intersection.py::test_two_unbounded_sets_that_make_a_simplex_project_and_support_like_it",
-    "test_sharp.py::test_strong_performativity_makes_the_local_test_only_local",
-    "test_sharp.py::test_unconstrained_response_jacobian_is_minus_inverse_hessian_times_reaction",
-    "test_sharp.py::test_contraction_estimate_is_a_lower_estimate_of_the_proved_modulus",
-    "test_certificates.py::test_contraction_bounds_are_never_exceeded_and_order_as_proved",
-    "test_stability_rates_orders.py::test_error_bounds_lie_above_measured_runs",
-    "test_stability_rates_orders.py::test_small_early_sensitivities_are_preferred_by_the_bound_and_not_always",
-    "test_stable_point.py::TestStablePoint::test_solutions_of_stacked_problems_and_keys_equal_single_runs",
-    "test_stable_point.py::test_stable_point_never_minimises_again_after_newton_when_minimisation_expands",
-    "test_continuation.py::TestContinuation::test_solutions_of_stacked_problems_and_keys_equal_single_runs",
-    "test_continuation.py::TestContinuation::test_history_keeps_the_record_of_every_other_step",
-    "test_continuation.py::test_continuation_finds_what_repeated_minimisation_cycles_about",
-    "test_best_response.py::test_constrained_best_response_matches_cvxpy_and_its_variational_inequality",
-    "test_rrm.py::TestRRM::test_solutions_of_stacked_problems_and_keys_equal_single_runs",
-    "test_reacting_noise.py::test_stable_point_is_its_own_best_response[rows]",
-    "test_two_gradients.py::test_descent_along_the_wrong_gradient_ends_elsewhere",
-    "test_properties.py::test_compiled_cost_equals_the_one_run_operation_by_operation",
 )
 
 

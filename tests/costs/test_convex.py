@@ -56,6 +56,7 @@ def problem(cost):
     )
 
 
+@pytest.mark.float32
 def test_convex_cost_written_as_a_quadratic_simulates_like_it():
     """The same numbers by automatic differentiation: costs, gradients and a run of RSGD."""
     one, two = problem(pc.QuadraticCost(Q, R)), problem(pc.ConvexCost(quadratic_stage))

@@ -61,6 +61,7 @@ def test_cost_and_gradient_match_enumeration_under_the_deployed_law():
     assert_close(pc.expected_cost_by_moments(problem(), M, deployed=DEPLOYED), expected[0])
 
 
+@pytest.mark.float32
 def test_the_deployed_policy_decides_the_law_and_the_evaluated_one_does_not():
     frozen = problem(law(DEPLOYED, 0.4))
     assert_close(

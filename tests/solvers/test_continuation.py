@@ -20,6 +20,7 @@ class TestContinuation(SolverContract):
     def solver(self):
         return SOLVER
 
+    @pytest.mark.float32
     def test_continuation_and_stable_point_agree(self):
         for problem, solution in zip(self.problems, self.singles, strict=True):
             assert_close(solution.M, pc.solve(problem, pc.StablePoint()).M, 1e-9, 1e-3)
