@@ -14,6 +14,8 @@ MASK = np.array([[True, True, False], [False, True, True]])
 
 
 class TestRowSumAndBox(SetContract):
+    support_tolerance = 1e-8  # what an intersection promises
+
     def feasible_set(self):
         return pc.Intersection([pc.Box(0.0, 0.6), pc.RowSum(1.0)])
 
@@ -32,6 +34,8 @@ class TestRowSumAndSupport(SetContract):
 
 
 class TestSpectralBallBoxAndRowSum(SetContract):
+    support_tolerance = 1e-8  # what an intersection promises
+
     def feasible_set(self):
         return pc.Intersection([pc.SpectralBall(1.2), pc.Intersection([pc.Box(-0.5, 0.5), pc.RowSum(0.3)])])
 
@@ -42,6 +46,8 @@ class TestSpectralBallBoxAndRowSum(SetContract):
 
 @pytest.mark.slow
 class TestTwoBalls(SetContract):
+    support_tolerance = 1e-8  # what an intersection promises
+
     def feasible_set(self):
         return pc.Intersection((pc.SpectralBall(0.8), pc.FrobeniusBall(1.0)))
 
