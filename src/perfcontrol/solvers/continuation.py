@@ -13,12 +13,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from perfcontrol._checks import check_integer, check_tolerance, fail
+from perfcontrol._checks import check_tolerance, fail
 from perfcontrol._linalg import frobenius
 from perfcontrol.evaluate.best_response import DENSE_LIMIT, respond, response_pushforward
-from perfcontrol.evaluate.exact import require_moments
 from perfcontrol.problem import PerformativeProblem
-from perfcontrol.solvers.loop import AbstractSolver, State, start
+from perfcontrol.solvers.exact_solver import AbstractExactSolver
+from perfcontrol.solvers.loop import State, start
 from perfcontrol.solvers.result import Result
 
 CORRECTIONS = 6  # Newton steps across the curve before a step along it counts as too long
@@ -36,7 +36,7 @@ class _Own(eqx.Module):
     unique: Array
 
 
-class Continuation(AbstractSolver):
+class Continuation(AbstractExactSolver):
     """A performatively stable policy by continuation from M_0; for bounded sets, where repeated minimisation fails.
 
     Needs a quadratic cost and known moments, and works with matrices of the policy's size: for up to 2048 free
@@ -54,20 +54,11 @@ class Continuation(AbstractSolver):
         Not in the paper; docs: theory, "Existence".
     """
 
-    tolerance: float | None = eqx.field(static=True)
-    limit: int = eqx.field(static=True)
-
     def __init__(self, tolerance: float | None = None, max_steps: int = 500):
-        self.tolerance = tolerance
-        self.limit = check_integer("max_steps", max_steps, 1)
-
-    @property
-    def max_steps(self) -> int:
-        return self.limit
+        super().__init__(tolerance, max_steps)
 
     def check(self, problem: PerformativeProblem) -> None:
-        require_moments(problem)
-        check_tolerance(self.tolerance, problem.dtype)
+        super().check(problem)
         size = problem.initial_policy().size
         if size > DENSE_LIMIT:
             raise fail("problem", f"{size} free parameters", f"have at most {DENSE_LIMIT}", "Use pc.StablePoint().")

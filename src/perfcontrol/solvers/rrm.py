@@ -4,12 +4,12 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from perfcontrol._checks import check_integer, check_tolerance
+from perfcontrol._checks import check_tolerance
 from perfcontrol._linalg import frobenius
 from perfcontrol.evaluate.best_response import respond
-from perfcontrol.evaluate.exact import require_moments
 from perfcontrol.problem import PerformativeProblem
-from perfcontrol.solvers.loop import AbstractSolver, State, start
+from perfcontrol.solvers.exact_solver import AbstractExactSolver
+from perfcontrol.solvers.loop import State, start
 from perfcontrol.solvers.result import Result
 
 
@@ -21,7 +21,7 @@ class _Own(eqx.Module):
     threshold: Array
 
 
-class RRM(AbstractSolver):
+class RRM(AbstractExactSolver):
     """M_{n+1} = Φ(M_n), exactly; ends when a step moves less than `tolerance` relative to ‖M‖.
 
     `.stats`: `rate` (last ratio of moves, an estimate of the contraction rate; 0 where there was no second move),
@@ -35,20 +35,8 @@ class RRM(AbstractSolver):
         Equation (RRM); Lemma on existence and uniqueness of M^PS.
     """
 
-    tolerance: float | None = eqx.field(static=True)
-    limit: int = eqx.field(static=True)
-
     def __init__(self, tolerance: float | None = None, max_steps: int = 500):
-        self.tolerance = tolerance
-        self.limit = check_integer("max_steps", max_steps, 1)
-
-    @property
-    def max_steps(self) -> int:
-        return self.limit
-
-    def check(self, problem: PerformativeProblem) -> None:
-        require_moments(problem)
-        check_tolerance(self.tolerance, problem.dtype)
+        super().__init__(tolerance, max_steps)
 
     def init(self, problem: PerformativeProblem, M0: Array) -> State:
         infinite = jnp.asarray(jnp.inf, M0.dtype)

@@ -12,12 +12,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from perfcontrol._checks import check_integer, check_tolerance
+from perfcontrol._checks import check_tolerance
 from perfcontrol._linalg import frobenius
 from perfcontrol.evaluate.best_response import Response, respond, response_pushforward
-from perfcontrol.evaluate.exact import require_moments
 from perfcontrol.problem import PerformativeProblem
-from perfcontrol.solvers.loop import AbstractSolver, State, start
+from perfcontrol.solvers.exact_solver import AbstractExactSolver
+from perfcontrol.solvers.loop import State, start
 from perfcontrol.solvers.result import Result
 
 CONTRACTING = 0.1  # repeated minimisation goes on while each step shrinks the gap at least tenfold
@@ -36,7 +36,7 @@ class _Own(eqx.Module):
     contracting: Array  # whether every step so far was one of minimisation that shrank the gap well
 
 
-class StablePoint(AbstractSolver):
+class StablePoint(AbstractExactSolver):
     """The fixed point M^PS = Φ(M^PS), to a relative natural residual of `tolerance`.
 
     Needs a quadratic cost and known moments; no sampling. Finds stable points at which repeated minimisation
@@ -48,20 +48,8 @@ class StablePoint(AbstractSolver):
         max_steps: at most so many steps.
     """
 
-    tolerance: float | None = eqx.field(static=True)
-    limit: int = eqx.field(static=True)
-
     def __init__(self, tolerance: float | None = None, max_steps: int = 60):
-        self.tolerance = tolerance
-        self.limit = check_integer("max_steps", max_steps, 1)
-
-    @property
-    def max_steps(self) -> int:
-        return self.limit
-
-    def check(self, problem: PerformativeProblem) -> None:
-        require_moments(problem)
-        check_tolerance(self.tolerance, problem.dtype)
+        super().__init__(tolerance, max_steps)
 
     def init(self, problem: PerformativeProblem, M0: Array) -> State:
         # The first step moves nowhere and evaluates M0: one place that compiles the best response.
