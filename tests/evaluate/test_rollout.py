@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import perfcontrol as pc
+from perfcontrol.evaluate.rollout import lanes
 from tests.evaluate.cases import BUILDERS, SmoothCost, case, replaced
 from tests.oracles.enumeration import Paths, simulate, stage_gradients
 from tests.tools import assert_close, assert_refused, relative_error
@@ -88,3 +89,18 @@ def test_simulation_refuses_bad_arguments(function):
 def test_one_sample_is_too_few_for_a_standard_error():
     c = case("zero means")
     assert_refused(lambda: pc.estimate_cost(c.problem, c.M, key=KEY, samples=1), "samples", "at least 2")
+
+
+def test_fewer_paths_are_worked_on_together_where_perturbations_are_large():
+    def dense(n, T):
+        return pc.PerformativeProblem(
+            system=pc.LinearSystem(0.1 * np.eye(n), np.eye(n)),
+            horizon=T,
+            noise=pc.Rademacher(np.ones(n)),
+            cost=pc.QuadraticCost(np.eye(n), np.eye(n)),
+            perturbation=pc.DensePerturbation(0.1),
+        )
+
+    assert lanes(dense(4, 10)) == 8
+    assert lanes(dense(100, 100)) == 2  # 8 MB a path
+    assert lanes(dense(100, 400)) == 1

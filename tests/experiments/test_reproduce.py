@@ -62,6 +62,24 @@ def test_runs_equal_single_solves_with_the_same_key(done: tuple[Path, Outcome]) 
     assert float(picked["cost"][-1]) == pytest.approx(cost, rel=1e-4)
 
 
+def test_block_of_stopped_runs_repeats_the_last_policy_and_its_cost() -> None:
+    problems = module._problems(SETTINGS, "rows")
+    lab = module._laboratory(SETTINGS, problems, xarray.Dataset())
+    case, seed = np.full(3, module.UNSTABLE), np.arange(3)
+    runs = lab.runs(5, case, seed, seed, module._constant(10.0))
+    (ended,) = lab.runner.run(runs, 300, lambda share: None)
+    assert set(ended.result) == {"diverged"}
+    assert ended.steps_taken.max() < 100, "stopped within the first compiled call"
+    np.testing.assert_array_equal(
+        ended.policies[:, 100:], np.broadcast_to(ended.policies[:, 99:100], (3, 201, 1, 10, 10))
+    )
+    cost = lab.runner.costs(runs, ended)
+    assert np.all(cost[:, 100:] == cost[:, 99:100])
+    assert float(cost[0, 0]) == pytest.approx(
+        float(pc.expected_cost(problems[module.UNSTABLE], runs.start[0])), rel=1e-4
+    )
+
+
 def test_claims_are_complete_and_existence_is_settled(done: tuple[Path, Outcome]) -> None:
     claims = json.loads((done[0] / "claims.json").read_text())
     assert all({"claim", "source", "statistic", "interval", "verdict"} <= set(claim) for claim in claims)

@@ -83,20 +83,19 @@ class Continuation(AbstractExactSolver):
         enough = jnp.where(last, jnp.minimum(0.01 * tolerance, 1e3 * eps), jnp.sqrt(eps)) * size
 
         def correct(carry: Any) -> Any:
-            y, move, predicted, *_, count = carry
+            y, move, *_, count = carry
             y = y - move
             gap, slope, residual, unique = _curve(problem, own.anchor, y)
-            predicted = jnp.where(count == 0, slope, predicted)
             move = jnp.linalg.solve(jnp.concatenate([slope, border[None]]), jnp.append(gap, 0))
-            return y, move, predicted, slope, jnp.linalg.norm(gap), residual, unique, count + 1
+            return y, move, slope, jnp.linalg.norm(gap), residual, unique, count + 1
 
         def unfinished(carry: Any) -> Array:
             _, move, *_, gap, _, _, count = carry
             return (count == 0) | ((gap > enough) & jnp.all(jnp.isfinite(move)) & (count < CORRECTIONS))
 
         nothing = jnp.zeros((here.size - 1, here.size), here.dtype)
-        began = (ahead, jnp.zeros_like(here), nothing, nothing, own.residual, own.residual, own.unique, jnp.asarray(0))
-        y, _, predicted, slope, gap, residual, unique, count = jax.lax.while_loop(unfinished, correct, began)
+        began = (ahead, jnp.zeros_like(here), nothing, own.residual, own.residual, own.unique, jnp.asarray(0))
+        y, _, slope, gap, residual, unique, count = jax.lax.while_loop(unfinished, correct, began)
         # The corrections at λ = 1 may stop at what rounding allows: there the natural residual decides.
         arrived = last & (residual <= tolerance)
         tangent, scale = _tangent(slope, border)
@@ -109,11 +108,6 @@ class Continuation(AbstractExactSolver):
         longer = jnp.minimum(jnp.where(count <= 3, 2, 1) * own.length, LONGEST * scale)
         length = jnp.where(good, jnp.where(first, FIRST * scale, longer), own.length / 2)
         stuck = ~good & (first | (length < SHORTEST * scale))
-        # Where a constraint becomes active or ceases to be, the curve has a kink, and may turn by more than a right
-        # angle: then no point of it lies ahead, and the tangent behind the kink is the one to follow.
-        beyond, _ = _tangent(predicted, border)
-        turns = ~good & short & jnp.all(jnp.isfinite(beyond)) & (beyond @ own.tangent < STRAIGHT)
-        tangent = jnp.where(good, tangent, jnp.where(turns, beyond, own.tangent))
         M = problem.feasible_set.project(y[:-1].reshape(state.M.shape))
         return State(
             jnp.where(good, M, state.M),
@@ -121,7 +115,7 @@ class Continuation(AbstractExactSolver):
             Result.where(arrived | stuck, Result.success, Result.running),  # `finish` tells which by the residual
             _Own(
                 jnp.where(good, y[-1], own.level),
-                tangent,
+                jnp.where(good, tangent, own.tangent),
                 length,
                 scale,
                 own.anchor,
