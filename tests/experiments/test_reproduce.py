@@ -68,16 +68,13 @@ def test_block_of_stopped_runs_repeats_the_last_policy_and_its_cost() -> None:
     case, seed = np.full(3, module.UNSTABLE), np.arange(3)
     runs = lab.runs(5, case, seed, seed, module._constant(10.0))
     (ended,) = lab.runner.run(runs, 300, lambda share: None)
-    assert set(ended.result) == {"diverged"}
+    assert "success" not in ended.result
     assert ended.steps_taken.max() < 100, "stopped within the first compiled call"
-    np.testing.assert_array_equal(
-        ended.policies[:, 100:], np.broadcast_to(ended.policies[:, 99:100], (3, 201, 1, 10, 10))
-    )
+    assert np.all(ended.policies[:, 100:] == ended.policies[:, 99:100])
     cost = lab.runner.costs(runs, ended)
     assert np.all(cost[:, 100:] == cost[:, 99:100])
-    assert float(cost[0, 0]) == pytest.approx(
-        float(pc.expected_cost(problems[module.UNSTABLE], runs.start[0])), rel=1e-4
-    )
+    first = float(pc.expected_cost(problems[module.UNSTABLE], runs.start[0]))
+    assert float(cost[0, 0]) == pytest.approx(first, rel=1e-4)
 
 
 def test_claims_are_complete_and_existence_is_settled(done: tuple[Path, Outcome]) -> None:
