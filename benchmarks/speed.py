@@ -18,7 +18,8 @@ from jax.sharding import PartitionSpec as P
 import perfcontrol as pc
 from benchmarks import numpy_gradients
 from perfcontrol.evaluate.adjoint import mean_path_gradient, path_gradient
-from perfcontrol.evaluate.exact import cost_and_gradient, cost_to_go, exact_cost
+from perfcontrol.evaluate.cost_to_go import cost_to_go
+from perfcontrol.evaluate.exact import cost_and_gradient, exact_cost
 from perfcontrol.evaluate.moments import cost_by_moments
 from perfcontrol.evaluate.rollout import lanes, sample_path
 from perfcontrol.experiments.batches import in_single_precision

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 import perfcontrol as pc
-from perfcontrol.evaluate.best_response import quadratic
-from perfcontrol.evaluate.exact import cost_to_go
+from perfcontrol.evaluate.cost_to_go import cost_to_go
+from perfcontrol.response.quadratic import quadratic
 from tests.tools import assert_close, normal
 
 T, H, N = 6, 2, 2  # horizon, memory, states and inputs: one shape for all

@@ -10,14 +10,12 @@ from perfcontrol.evaluate import (
     Estimate,
     StateMoments,
     Trajectories,
-    best_response,
     estimate_cost,
     expected_cost,
     expected_cost_by_moments,
     expected_gradient,
     path_gradient,
     recover_noise,
-    residual,
     sample_gradient,
     simulate,
     state_moments,
@@ -45,6 +43,7 @@ from perfcontrol.random_vectors import (
     TruncatedGaussian,
     Uniform,
 )
+from perfcontrol.response import best_response, residual
 from perfcontrol.sets import (
     AbstractSet,
     AbstractStructure,

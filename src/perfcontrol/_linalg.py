@@ -7,6 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from perfcontrol._programs import numerics
+
 
 def along_time(array: Any, inner_ndim: int, length: int) -> Any:
     """`array` (or `Diagonal`) with a leading time axis: broadcast if constant, as it is if it has one already."""
@@ -24,9 +26,19 @@ def transpose(matrix: Any) -> Any:
     return jnp.swapaxes(matrix, -1, -2)
 
 
-def frobenius(M: Array) -> Array:
+def frobenius(M: Any) -> Any:
     """‖M‖_F over all axes."""
-    return jnp.sqrt(jnp.sum(M**2))
+    xp, _ = numerics(M)
+    return xp.sqrt(xp.sum(M**2))
+
+
+def solve(matrix: Any, right: Any) -> Any:
+    """matrix⁻¹ right; not finite where the matrix is singular."""
+    xp, _ = numerics(matrix, right)
+    try:
+        return xp.linalg.solve(matrix, right)
+    except np.linalg.LinAlgError:  # NumPy alone raises
+        return np.full_like(right, np.nan)
 
 
 def symmetrise(matrix: Array) -> Array:

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import perfcontrol as pc
-from perfcontrol.evaluate.exact import cost_to_go, exact_cost
+from perfcontrol.evaluate.cost_to_go import cost_to_go
+from perfcontrol.evaluate.exact import exact_cost
 from tests.evaluate.cases import BUILDERS, FiniteNoise, SmoothCost, case, normal, replaced
 from tests.oracles.lqr import infinite_horizon_cost, riccati_gain
 from tests.tools import assert_close, assert_refused, central_differences, relative_error

@@ -1,7 +1,6 @@
 """What a policy costs: by simulation and exactly; its gradients; its best response."""
 
 from perfcontrol.evaluate.adjoint import path_gradient, recover_noise, sample_gradient
-from perfcontrol.evaluate.best_response import best_response, residual
 from perfcontrol.evaluate.exact import expected_cost, expected_gradient
 from perfcontrol.evaluate.moments import StateMoments, expected_cost_by_moments, state_moments
 from perfcontrol.evaluate.rollout import Estimate, Trajectories, estimate_cost, simulate
@@ -10,14 +9,12 @@ __all__ = [
     "Estimate",
     "StateMoments",
     "Trajectories",
-    "best_response",
     "estimate_cost",
     "expected_cost",
     "expected_cost_by_moments",
     "expected_gradient",
     "path_gradient",
     "recover_noise",
-    "residual",
     "sample_gradient",
     "simulate",
     "state_moments",

@@ -8,13 +8,13 @@ Algorithm 1 leaves out of its own objective, is included.
 
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from perfcontrol._checks import check_integer, check_key
 from perfcontrol._linalg import rmatvec
+from perfcontrol._programs import program
 from perfcontrol.evaluate.rollout import Path, Trajectories, check_pair, input_adjoint, input_term, lanes, sample_path
 from perfcontrol.policy import feedforward_adjoint
 from perfcontrol.problem import PerformativeProblem
@@ -87,7 +87,7 @@ def mean_path_gradient(
     return jnp.mean(jax.lax.map(one, jnp.arange(samples), batch_size=min(lanes(problem), samples)), axis=0)
 
 
-_compiled_mean_path_gradient = eqx.filter_jit(mean_path_gradient)
+_compiled_mean_path_gradient = program(mean_path_gradient, on_device=True)
 
 
 def sample_gradient(

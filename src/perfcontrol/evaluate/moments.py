@@ -13,8 +13,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from perfcontrol._checks import check_finite
-from perfcontrol._linalg import along_time, symmetrise
-from perfcontrol.evaluate.exact import known_covariance, mean_dynamics, require_moments
+from perfcontrol._linalg import along_time, as_dense, symmetrise
+from perfcontrol._programs import program
+from perfcontrol.evaluate.cost_to_go import known_covariance, require_moments
 from perfcontrol.evaluate.rollout import check_pair
 from perfcontrol.policy import lagged
 from perfcontrol.problem import PerformativeProblem
@@ -33,6 +34,19 @@ class StateMoments(eqx.Module):
     def covariance(self) -> Array:
         """Cov z_t, (T+1, n+m, n+m)."""
         return self.second - self.mean[:, :, None] * self.mean[:, None, :]
+
+
+def mean_dynamics(problem: PerformativeProblem, reacting: Array) -> tuple[Array, Array]:
+    """[A_t, B_t] + Θ_t, (T, n, n+m), and the matrix [[I, 0], [-K_t, I]] from [x; v] to [x; u], (T+1, n+m, n+m)."""
+    n, m, T = problem.state_size, problem.input_size, problem.horizon
+    known_covariance(problem, reacting)
+    Theta = problem.perturbation.mean(reacting, T)
+    assert Theta is not None  # where the covariance is known, so is the mean
+    A, B = as_dense(problem.system.A), as_dense(problem.system.B)
+    joint = jnp.concatenate([along_time(A, 2, T), along_time(B, 2, T)], axis=-1)
+    joint = joint.at[..., : Theta.shape[-1]].add(Theta)
+    eye = jnp.eye(n + m, dtype=joint.dtype)
+    return joint, jnp.broadcast_to(eye, (T + 1, n + m, n + m)).at[:, n:, :n].set(-problem.gains())
 
 
 def moments_of(problem: PerformativeProblem, policy: Array, reacting: Array) -> StateMoments:
@@ -101,10 +115,11 @@ def cost_by_moments(problem: PerformativeProblem, M: Array, deployed: Array) -> 
     return jnp.sum(form.matrix * moments.second) + 2 * jnp.sum(form.linear * moments.mean) + jnp.sum(form.constant)
 
 
-_compiled_moments = eqx.filter_jit(
-    lambda problem, M, deployed: moments_of(problem, problem.structure.lift(M), problem.structure.lift(deployed))
+_compiled_moments = program(
+    lambda problem, M, deployed: moments_of(problem, problem.structure.lift(M), problem.structure.lift(deployed)),
+    on_device=True,
 )
-_compiled_cost = eqx.filter_jit(cost_by_moments)
+_compiled_cost = program(cost_by_moments, on_device=True)
 
 
 def state_moments(problem: PerformativeProblem, M: Any, *, deployed: Any = None) -> StateMoments:

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, Key
 
 from perfcontrol._checks import check_integer, check_key
 from perfcontrol._linalg import Diagonal, Matrix, along_time, matvec
+from perfcontrol._programs import program
 from perfcontrol.perturbations import Draws
 from perfcontrol.policy import feedforward
 from perfcontrol.problem import PerformativeProblem
@@ -110,7 +111,7 @@ def lanes(problem: PerformativeProblem) -> int:
     return max(1, min(LANES, CACHE // max(size, 1)))
 
 
-@eqx.filter_jit
+@program(on_device=True)
 def _simulate(problem: PerformativeProblem, M: Array, deployed: Array, key: Array, samples: int) -> Trajectories:
     policy, reacting = problem.structure.lift(M), problem.structure.lift(deployed)
 
@@ -121,7 +122,7 @@ def _simulate(problem: PerformativeProblem, M: Array, deployed: Array, key: Arra
     return Trajectories(*jax.lax.map(one, jnp.arange(samples), batch_size=min(lanes(problem), samples)))
 
 
-@eqx.filter_jit
+@program(on_device=True)
 def _path_costs(problem: PerformativeProblem, M: Array, deployed: Array, key: Array, samples: int) -> Array:
     policy, reacting = problem.structure.lift(M), problem.structure.lift(deployed)
 

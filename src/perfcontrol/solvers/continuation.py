@@ -9,14 +9,15 @@ back in λ on its way, so it is followed by arc length: a step along the tangent
 from typing import Any
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
-from jaxtyping import Array
 
 from perfcontrol._checks import check_tolerance, fail
-from perfcontrol._linalg import frobenius
-from perfcontrol.evaluate.best_response import DENSE_LIMIT, respond, response_pushforward
+from perfcontrol._linalg import frobenius, solve
+from perfcontrol._programs import Numbers, choose, cond, numerics, while_loop
 from perfcontrol.problem import PerformativeProblem
+from perfcontrol.response import residual_of, respond, response_jacobian
+from perfcontrol.response.projected import nearest, projection_slope
+from perfcontrol.response.quadratic import DENSE_LIMIT
+from perfcontrol.sets import Unconstrained
 from perfcontrol.solvers.exact_solver import AbstractExactSolver
 from perfcontrol.solvers.loop import State, start
 from perfcontrol.solvers.result import Result
@@ -27,13 +28,12 @@ FIRST, LONGEST, BEND, SHORTEST = 0.05, 0.5, 1e-4, 1e-9  # steps, relative to the
 
 
 class _Own(eqx.Module):
-    level: Array  # λ
-    tangent: Array  # (p+1,), unit
-    length: Array  # of the next step along the curve
-    scale: Array  # ‖(Φ(a) - a, 1)‖
-    anchor: Array
-    residual: Array
-    unique: Array
+    level: Numbers  # λ
+    tangent: Numbers  # (p+1,), unit
+    length: Numbers  # of the next step along the curve
+    scale: Numbers  # ‖(Φ(a) - a, 1)‖
+    anchor: Numbers
+    unique: Numbers
 
 
 class Continuation(AbstractExactSolver):
@@ -63,97 +63,98 @@ class Continuation(AbstractExactSolver):
         if size > DENSE_LIMIT:
             raise fail("problem", f"{size} free parameters", f"have at most {DENSE_LIMIT}", "Use pc.StablePoint().")
 
-    def init(self, problem: PerformativeProblem, M0: Array) -> State:
-        zero, far = jnp.zeros((), M0.dtype), jnp.asarray(jnp.inf, M0.dtype)
-        along = jnp.zeros(M0.size + 1, M0.dtype).at[-1].set(1)
+    def init(self, problem: PerformativeProblem, M0: Any) -> State:
+        xp, _ = numerics(M0)
+        zero = xp.zeros((), M0.dtype)
+        along = xp.eye(M0.size + 1, dtype=M0.dtype)[-1]
         # The first step has no length: it evaluates the anchor and finds the curve's tangent there.
-        return start(M0, _Own(zero, along, zero, zero, M0, far, jnp.asarray(True)))
+        return start(M0, _Own(zero, along, zero, zero, M0, xp.asarray(True)))
 
-    def step(self, problem: PerformativeProblem, state: State, key: Array | None) -> State:
+    def step(self, problem: PerformativeProblem, state: State, key: Any) -> State:
         own, first = state.own, state.steps == 0
+        xp, _ = numerics(problem, state)
         tolerance = check_tolerance(self.tolerance, problem.dtype)
-        eps = jnp.finfo(state.M.dtype).eps
-        here = jnp.append(state.M.reshape(-1), own.level)
+        eps = xp.finfo(state.M.dtype).eps
+        here = xp.append(state.M.reshape(-1), own.level)
+        end = xp.eye(here.size, dtype=here.dtype)[-1]
         ahead = here + own.length * own.tangent
         # A step that would pass λ = 1 ends there, and the corrections stay there.
         last = ahead[-1] >= 1
-        ahead = jnp.where(last, here + (1 - own.level) / own.tangent[-1] * own.tangent, ahead)
-        border = jnp.where(last, jnp.zeros_like(here).at[-1].set(1), own.tangent)
+        rest = (1 - own.level) / xp.where(own.tangent[-1] == 0, 1, own.tangent[-1])
+        ahead = xp.where(last, here + rest * own.tangent, ahead)
+        border = xp.where(last, end, own.tangent)
         size = 1 + frobenius(own.anchor)
-        enough = jnp.where(last, jnp.minimum(0.01 * tolerance, 1e3 * eps), jnp.sqrt(eps)) * size
+        enough = xp.where(last, xp.minimum(0.01 * tolerance, 1e3 * eps), xp.sqrt(eps)).astype(size.dtype) * size
 
         def correct(carry: Any) -> Any:
             y, move, *_, count = carry
             y = y - move
-            gap, slope, residual, unique = _curve(problem, own.anchor, y)
-            move = jnp.linalg.solve(jnp.concatenate([slope, border[None]]), jnp.append(gap, 0))
-            return y, move, slope, jnp.linalg.norm(gap), residual, unique, count + 1
+            gap, slope, unique = _curve(problem, own.anchor, y)
+            move = solve(xp.concatenate([slope, border[None]]), xp.append(gap, xp.zeros((), gap.dtype)))
+            return y, move, slope, xp.linalg.norm(gap), unique, count + 1
 
-        def unfinished(carry: Any) -> Array:
-            _, move, *_, gap, _, _, count = carry
-            return (count == 0) | ((gap > enough) & jnp.all(jnp.isfinite(move)) & (count < CORRECTIONS))
+        def unfinished(carry: Any) -> Any:
+            _, move, _, gap, _, count = carry
+            return (count == 0) | ((gap > enough) & xp.all(xp.isfinite(move)) & (count < CORRECTIONS))
 
-        nothing = jnp.zeros((here.size - 1, here.size), here.dtype)
-        began = (ahead, jnp.zeros_like(here), nothing, own.residual, own.residual, own.unique, jnp.asarray(0))
-        y, _, slope, gap, residual, unique, count = jax.lax.while_loop(unfinished, correct, began)
+        nothing = xp.zeros((here.size - 1, here.size), here.dtype)
+        far = xp.asarray(xp.inf, here.dtype)
+        began = (ahead, xp.zeros_like(here), nothing, far, own.unique, xp.asarray(0))
+        y, _, slope, gap, unique, count = while_loop(unfinished, correct, began)
+        M = nearest(problem.feasible_set, y[:-1].reshape(state.M.shape))
         # The corrections at λ = 1 may stop at what rounding allows: there the natural residual decides.
-        arrived = last & (residual <= tolerance)
-        tangent, scale = _tangent(slope, border)
-        scale = jnp.where(first, scale, own.scale)
+        arrived = cond(last, lambda: residual_of(problem, M, M) <= tolerance, lambda: xp.asarray(False))
+        tangent, scale = _tangent(slope, border, end)
+        scale = xp.where(first, scale, own.scale)
         # Not across a fold: a step whose corrections lead far away has met another part of the curve.
-        near = jnp.linalg.norm(y - ahead) <= 0.5 * jnp.linalg.norm(ahead - here) + enough
+        near = xp.linalg.norm(y - ahead) <= 0.5 * xp.linalg.norm(ahead - here) + enough
         short = own.length < BEND * scale
         straight = first | short | (tangent @ own.tangent >= STRAIGHT)
-        good = arrived | (~last & (gap <= enough) & near & straight & jnp.all(jnp.isfinite(tangent)))
-        longer = jnp.minimum(jnp.where(count <= 3, 2, 1) * own.length, LONGEST * scale)
-        length = jnp.where(good, jnp.where(first, FIRST * scale, longer), own.length / 2)
+        good = arrived | (~last & (gap <= enough) & near & straight & xp.all(xp.isfinite(tangent)))
+        longer = xp.minimum(xp.where(count <= 3, 2, 1).astype(scale.dtype) * own.length, LONGEST * scale)
+        length = xp.where(good, xp.where(first, FIRST * scale, longer), own.length / 2)
         stuck = ~good & (first | (length < SHORTEST * scale))
-        M = problem.feasible_set.project(y[:-1].reshape(state.M.shape))
-        return State(
-            jnp.where(good, M, state.M),
-            state.steps + 1,
-            Result.where(arrived | stuck, Result.success, Result.running),  # `finish` tells which by the residual
-            _Own(
-                jnp.where(good, y[-1], own.level),
-                jnp.where(good, tangent, own.tangent),
-                length,
-                scale,
-                own.anchor,
-                jnp.where(good, residual, own.residual),
-                jnp.where(good, unique, own.unique),
-            ),
+        ended = choose(arrived | stuck, Result.success, Result.running)  # `finish` tells which by the residual
+        moved = choose(
+            good,
+            (M, y[-1], tangent, unique),
+            (state.M, own.level, own.tangent, own.unique),
         )
+        kept = _Own(moved[1], moved[2], length, scale, own.anchor, moved[3])
+        return State(moved[0], state.steps + 1, ended, kept)
 
-    def finish(self, problem: PerformativeProblem, state: State, stopped: bool) -> tuple[Result, dict[str, Array]]:
+    def finish(self, problem: PerformativeProblem, state: State, stopped: bool) -> tuple[Result, dict[str, Any]]:
         own = state.own
+        residual = residual_of(problem, state.M, state.M)
         unfinished = Result.running if stopped else Result.not_converged
-        arrived = (own.level >= 1) & (own.residual <= check_tolerance(self.tolerance, problem.dtype))
-        stats = {"residual": own.residual, "unique": own.unique, "level": own.level}
-        return Result.where(arrived, Result.success, unfinished), stats
+        arrived = (own.level >= 1) & (residual <= check_tolerance(self.tolerance, problem.dtype))
+        stats = {"residual": residual, "unique": own.unique, "level": own.level}
+        return choose(arrived, Result.success, unfinished), stats
 
 
-def _tangent(slope: Array, border: Array) -> tuple[Array, Array]:
+def _tangent(slope: Any, border: Any, end: Any) -> tuple[Any, Any]:
     """The unit null vector of the Jacobian (p, p+1) that goes on along the curve, and its length before scaling.
 
     Along the whole curve, folds and kinks included, det [slope; tangent] keeps the sign that it has at λ = 0.
     """
-    end = jnp.zeros_like(border).at[-1].set(1)
-    tangent = jnp.linalg.solve(jnp.concatenate([slope, border[None]]), end)
-    scale = jnp.linalg.norm(tangent)
-    sign, _ = jnp.linalg.slogdet(jnp.concatenate([slope, tangent[None] / scale]))
+    xp, _ = numerics(slope)
+    tangent = solve(xp.concatenate([slope, border[None]]), end)
+    scale = xp.linalg.norm(tangent)
+    sign, _ = xp.linalg.slogdet(xp.concatenate([slope, tangent[None] / scale]))
     return sign * tangent / scale, scale
 
 
-def _curve(problem: PerformativeProblem, anchor: Array, y: Array) -> tuple[Array, Array, Array, Array]:
-    """M - (1-λ) a - λ Φ(M) at y = (M, λ), its Jacobian (p, p+1), and what the best response says of itself."""
-    shape, p = anchor.shape, anchor.size
-    eye = jnp.eye(p, dtype=y.dtype)
+def _curve(problem: PerformativeProblem, anchor: Any, y: Any) -> tuple[Any, Any, Any]:
+    """M - (1-λ) a - λ Φ(M) at y = (M, λ), its Jacobian (p, p+1), and whether the best response is unique."""
+    xp, _ = numerics(problem, anchor, y)
+    point = y[:-1].reshape(anchor.shape)
     # Corrections may leave the set, where the perturbation's law need not exist: Φ sees the nearest point of it.
-    M, inward = jax.linearize(problem.feasible_set.project, y[:-1].reshape(shape))
+    M = nearest(problem.feasible_set, point)
     response = respond(problem, M)
-    pushforward = response_pushforward(problem, M, response.M)
-    image = jax.vmap(lambda row: pushforward(inward(row.reshape(shape))).reshape(-1))(eye).T
+    image = response_jacobian(problem, M, response.M)
+    if not isinstance(problem.feasible_set, Unconstrained):
+        image = image @ projection_slope(problem.feasible_set, point)
     away = (response.M - anchor).reshape(-1)
     gap = y[:-1] - anchor.reshape(-1) - y[-1] * away
-    slope = jnp.concatenate([eye - y[-1] * image, -away[:, None]], axis=1)
-    return gap, slope, response.residual, response.unique
+    slope = xp.concatenate([xp.eye(anchor.size, dtype=y.dtype) - y[-1] * image, -away[:, None]], axis=1)
+    return gap, slope, response.unique

@@ -3,7 +3,7 @@
 import equinox as eqx
 
 from perfcontrol._checks import check_integer, check_tolerance
-from perfcontrol.evaluate.exact import require_moments
+from perfcontrol.evaluate.cost_to_go import require_moments
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.solvers.loop import AbstractSolver
 
@@ -24,6 +24,10 @@ class AbstractExactSolver(AbstractSolver):
     @property
     def max_steps(self) -> int:
         return self.limit
+
+    @property
+    def from_host(self) -> bool:
+        return True
 
     def check(self, problem: PerformativeProblem) -> None:
         require_moments(problem)

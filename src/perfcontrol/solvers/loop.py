@@ -7,9 +7,11 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int
+import numpy as np
+from jaxtyping import Array
 
 from perfcontrol._checks import check_integer, check_key, fail, is_concrete
+from perfcontrol._programs import Numbers, numerics, on_host, program
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.solvers.result import Result
 
@@ -29,8 +31,8 @@ class SolveError(RuntimeError):
 class State(eqx.Module):
     """What every solver carries: the iterate, the number of steps taken, how the run stands, the solver's own."""
 
-    M: Array
-    steps: Int[Array, ""]
+    M: Numbers
+    steps: Numbers
     result: Result
     own: Any
 
@@ -48,20 +50,25 @@ class AbstractSolver(eqx.Module):
         """Whether steps draw random numbers."""
         return False
 
+    @property
+    def from_host(self) -> bool:
+        """Whether steps do their heavy work in programs of their own, so that the loop need not be compiled."""
+        return False
+
     @abc.abstractmethod
     def check(self, problem: PerformativeProblem) -> None:
         """Raise InputError where this method does not apply to the problem."""
 
     @abc.abstractmethod
-    def init(self, problem: PerformativeProblem, M0: Array) -> State:
+    def init(self, problem: PerformativeProblem, M0: Any) -> State:
         """The state before the first step."""
 
     @abc.abstractmethod
-    def step(self, problem: PerformativeProblem, state: State, key: Array | None) -> State:
+    def step(self, problem: PerformativeProblem, state: State, key: Any) -> State:
         """One iteration; `key` is that iteration's own."""
 
     @abc.abstractmethod
-    def finish(self, problem: PerformativeProblem, state: State, stopped: bool) -> tuple[Result, dict[str, Array]]:
+    def finish(self, problem: PerformativeProblem, state: State, stopped: bool) -> tuple[Result, dict[str, Any]]:
         """Result and statistics of the last state; `stopped` says that max_steps of `solve` cut the run short."""
 
 
@@ -80,9 +87,10 @@ class Solution(eqx.Module):
     stats: dict[str, Array]
 
 
-def start(M0: Array, own: Any = None) -> State:
+def start(M0: Any, own: Any = None) -> State:
     """The first state."""
-    return State(M0, jnp.zeros((), int), Result.running, own)
+    xp, _ = numerics(M0)
+    return State(M0, xp.zeros((), int), Result.running, own)
 
 
 def _run(
@@ -120,13 +128,12 @@ def run_steps(
     return _run(solver, problem, state, key, first, count, _identity, 1)
 
 
-_compiled_run = eqx.filter_jit(_run)
-_compiled_record = eqx.filter_jit(lambda record, M: record(M))
-_compiled_init = eqx.filter_jit(lambda solver, problem, M0: solver.init(problem, M0))
-_compiled_finish = eqx.filter_jit(lambda solver, problem, state, stopped: solver.finish(problem, state, stopped))
+_compiled_run = program(_run, on_device=True)
+_compiled_record = program(lambda record, M: record(M))
+_compiled_init = program(lambda solver, problem, M0: solver.init(problem, M0), on_device=True)
 
 
-def _identity(M: Array) -> Array:
+def _identity(M: Any) -> Any:
     return M
 
 
@@ -183,11 +190,16 @@ def solve(
     record = _identity if record is None else record
     stopped = max_steps is not None and max_steps < solver.max_steps
     if not concrete:
-        solution = _traced(problem, solver, M0, key, total, record, every, stopped)
-    else:
-        solution = _on_host(problem, solver, M0, key, total, record, every, stopped, progress)
-        if throw and solution.result != Result.success:
-            raise SolveError(f"{Result[solution.result]} (step {int(solution.steps)})", solution)
+        return _traced(problem, solver, M0, key, total, record, every, stopped)
+    run = _from_host if solver.from_host else _in_chunks
+    with np.errstate(all="ignore"):  # numbers that are not finite become a named result
+        state, history = run(problem, solver, M0, key, total, record, every, progress)
+        state = on_host(state)
+        result, stats = solver.finish(problem, state, stopped)
+    answer = jax.tree.map(jnp.asarray, (state.M, result, state.steps, _joined(history), stats))
+    solution = Solution(*answer)
+    if throw and result != Result.success:
+        raise SolveError(f"{Result[result]} (step {int(state.steps)})", solution)
     return solution
 
 
@@ -216,7 +228,10 @@ def _traced(
     return Solution(state.M, result, state.steps, _joined(history), stats)
 
 
-def _on_host(
+Progress = Callable[[int, int], None] | None
+
+
+def _in_chunks(
     problem: PerformativeProblem,
     solver: AbstractSolver,
     M0: Array,
@@ -224,17 +239,17 @@ def _on_host(
     total: int,
     record: Record,
     every: int,
-    stopped: bool,
-    progress: Callable[[int, int], None] | None,
-) -> Solution:
+    progress: Progress,
+) -> tuple[State, list[Any]]:
+    """The run in compiled chunks, and its history in pieces."""
     state = _compiled_init(solver, problem, M0)
-    history = [jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], _compiled_record(record, M0))]
+    history = [_first(record, M0)]
     chunk = max(every, CHUNK - CHUNK % every)
     done = 0
     while done < total:
         count = min(chunk, total - done)
         whole = count - count % every
-        first = jnp.asarray(done)
+        first = np.asarray(done)
         if whole:
             state, recorded = _compiled_run(solver, problem, state, key, first, whole, record, every)
             history.append(recorded)
@@ -245,16 +260,49 @@ def _on_host(
             progress(done, total)
         if state.result != Result.running:
             break
-    result, stats = _compiled_finish(solver, problem, state, stopped)
-    missing = (total - done) // every if done % every == 0 else 0
-    if missing:  # ended early: as long as under jit, the last value repeated
-        history.append(jax.tree.map(lambda leaf: jnp.repeat(leaf[-1:], missing, axis=0), history[-1]))
-    return Solution(state.M, result, state.steps, _joined(history), stats)
+    if done % every == 0:
+        history.append(_repeated(history[-1], (total - done) // every))
+    return state, history
 
 
-def _nothing(M: Array) -> Array:
+def _from_host(
+    problem: PerformativeProblem,
+    solver: AbstractSolver,
+    M0: Array,
+    key: Array | None,
+    total: int,
+    record: Record,
+    every: int,
+    progress: Progress,
+) -> tuple[State, list[Any]]:
+    """The run step by step: the solver's own programs do the work."""
+    state = solver.init(problem, on_host(M0))
+    history = [_first(record, M0)]
+    for done in range(1, total + 1):
+        state = solver.step(problem, state, None if key is None else jax.random.fold_in(key, done - 1))
+        if done % every == 0:
+            history.append(_first(record, state.M))
+        if progress is not None:
+            progress(done, total)
+        if state.result != Result.running:
+            break
+    return state, [*history, _repeated(history[-1], total // every + 1 - len(history))]
+
+
+def _first(record: Record, M: Any) -> Any:
+    value = on_host(M) if record is _identity else _compiled_record(record, M)
+    return jax.tree.map(lambda leaf: leaf[None], value)
+
+
+def _repeated(recorded: Any, count: int) -> Any:
+    """What a run that ended early lacks to be as long as under jit."""
+    return jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf)[-1:], count, axis=0), recorded)
+
+
+def _nothing(M: Any) -> Array:
     return jnp.zeros(())
 
 
 def _joined(history: list[Any]) -> Any:
-    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *history)
+    xp, _ = numerics(history)
+    return jax.tree.map(lambda *leaves: xp.concatenate(leaves), *history)

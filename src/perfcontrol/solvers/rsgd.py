@@ -5,9 +5,10 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int
+from jaxtyping import Array
 
 from perfcontrol._checks import check_integer
+from perfcontrol._programs import Numbers, choose
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.solvers.gradients import Pathwise
 from perfcontrol.solvers.loop import AbstractSolver, State, start
@@ -19,10 +20,10 @@ DIVERGENCE = 1e8  # growth of ‖M‖ over 1 + ‖M_0‖ at which a run is calle
 
 
 class _Own(eqx.Module):
-    count: Int[Array, ""]
-    deployments: Int[Array, ""]
-    deployed: Array
-    threshold: Array
+    count: Numbers
+    deployments: Numbers
+    deployed: Numbers
+    threshold: Numbers
     transform_state: Any
 
 
@@ -107,7 +108,7 @@ class RSGD(AbstractSolver):
             _Own(own.count + 1, own.deployments + deploys, deployed, own.threshold, kept),
         )
 
-    def finish(self, problem: PerformativeProblem, state: State, stopped: bool) -> tuple[Result, dict[str, Array]]:
+    def finish(self, problem: PerformativeProblem, state: State, stopped: bool) -> tuple[Result, dict[str, Any]]:
         # A fixed number of steps is what was asked for: reaching it, or the max_steps of `solve`, is success.
-        result = Result.where(state.result == Result.running, Result.success, state.result)
+        result = choose(state.result == Result.running, Result.success, state.result)
         return result, {"deployments": state.own.deployments}

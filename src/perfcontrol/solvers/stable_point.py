@@ -13,9 +13,11 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from perfcontrol._checks import check_tolerance
-from perfcontrol._linalg import frobenius
-from perfcontrol.evaluate.best_response import Response, respond, response_pushforward
+from perfcontrol._linalg import frobenius, solve
+from perfcontrol._programs import Numbers, choose, cond, numerics, program, while_loop
 from perfcontrol.problem import PerformativeProblem
+from perfcontrol.response import Response, residual_of, respond, response_jacobian, response_pushforward
+from perfcontrol.response.projected import nearest
 from perfcontrol.solvers.exact_solver import AbstractExactSolver
 from perfcontrol.solvers.loop import State, start
 from perfcontrol.solvers.result import Result
@@ -23,17 +25,17 @@ from perfcontrol.solvers.result import Result
 CONTRACTING = 0.1  # repeated minimisation goes on while each step shrinks the gap at least tenfold
 HALVINGS = 6
 KRYLOV = 30
+DENSE = 64  # free parameters up to which Φ' is a matrix, not products
 FAR = 1e8  # growth of ‖M‖ over 1 + ‖M_0‖ + ‖Φ(M_0)‖ beyond which a Newton step is refused: see `step`
 
 
 class _Own(eqx.Module):
-    response: Array  # Φ(M)
-    gap: Array  # ‖Φ(M) - M‖
-    ratio: Array  # of the last two gaps
-    unique: Array
-    residual: Array  # relative natural residual of M
-    limit: Array  # of ‖M‖
-    contracting: Array  # whether every step so far was one of minimisation that shrank the gap well
+    response: Numbers  # Φ(M)
+    gap: Numbers  # ‖Φ(M) - M‖
+    ratio: Numbers  # of the last two gaps
+    unique: Numbers
+    limit: Numbers  # of ‖M‖
+    contracting: Numbers  # whether every step so far was one of minimisation that shrank the gap well
 
 
 class StablePoint(AbstractExactSolver):
@@ -51,73 +53,80 @@ class StablePoint(AbstractExactSolver):
     def __init__(self, tolerance: float | None = None, max_steps: int = 60):
         super().__init__(tolerance, max_steps)
 
-    def init(self, problem: PerformativeProblem, M0: Array) -> State:
-        # The first step moves nowhere and evaluates M0: one place that compiles the best response.
-        far = jnp.asarray(jnp.inf, M0.dtype)
-        return start(M0, _Own(M0, far, jnp.zeros((), M0.dtype), jnp.asarray(True), far, far, jnp.asarray(True)))
+    def init(self, problem: PerformativeProblem, M0: Any) -> State:
+        # The first step moves nowhere and evaluates M0.
+        xp, _ = numerics(M0)
+        far, yes = xp.asarray(xp.inf, M0.dtype), xp.asarray(True)
+        return start(M0, _Own(M0, far, xp.zeros((), M0.dtype), yes, far, yes))
 
-    def step(self, problem: PerformativeProblem, state: State, key: Array | None) -> State:
+    def step(self, problem: PerformativeProblem, state: State, key: Any) -> State:
         own = state.own
         contracting = own.contracting
         F = own.response - state.M
-        direction = jax.lax.cond(contracting, lambda: F, lambda: _newton_direction(problem, state.M, own.response))
+        direction = cond(contracting, lambda: F, lambda: _newton_direction(problem, state.M, own.response))
+        xp, _ = numerics(problem, state)
 
         # Repeated minimisation takes its step as it is; Newton halves its own until the gap shrinks. Where Φ' has the
         # eigenvalue 1 up to rounding, Newton points to infinity, where every relative gap is small: not that far.
-        def helps(M: Array, gap: Array) -> Array:
+        def helps(M: Any, gap: Any) -> Any:
             return (gap < own.gap) & (frobenius(M) <= own.limit)
 
         def try_length(carry: Any) -> Any:
             length, count, *_ = carry
-            M = problem.feasible_set.project(state.M + length * direction)
+            M = nearest(problem.feasible_set, state.M + length * direction)
             response = respond(problem, M)
             return length / 2, count + 1, M, response, frobenius(response.M - M)
 
-        def unaccepted(carry: Any) -> Array:
+        def unaccepted(carry: Any) -> Any:
             _, count, M, _, gap = carry
             return (count == 0) | (~contracting & ~helps(M, gap) & (count < HALVINGS))
 
-        one = jnp.ones((), F.dtype)
-        known = Response(own.response, own.unique, own.residual)
-        _, _, M, response, gap = jax.lax.while_loop(
-            unaccepted, try_length, (one, jnp.asarray(0), state.M, known, own.gap)
-        )
-        finite = jnp.isfinite(gap) & jnp.all(jnp.isfinite(M))
-        ratio = gap / jnp.where(own.gap > 0, own.gap, 1)  # zero at the first step: a step of minimisation follows
-        limit = jnp.where(state.steps == 0, FAR * (1 + frobenius(M) + frobenius(response.M)), own.limit)
+        first = (xp.ones((), F.dtype), xp.asarray(0), state.M, Response(own.response, own.unique), own.gap)
+        _, _, M, response, gap = while_loop(unaccepted, try_length, first)
+        finite = xp.isfinite(gap) & xp.all(xp.isfinite(M))
+        ratio = gap / xp.where(own.gap > 0, own.gap, 1)  # zero at the first step: a step of minimisation follows
+        limit = xp.where(state.steps == 0, FAR * (1 + frobenius(M) + frobenius(response.M)), own.limit)
         tolerance = check_tolerance(self.tolerance, problem.dtype)
         scale = frobenius(M)
-        done = gap <= 0.1 * tolerance * jnp.where(scale > 0, scale, 1)
+        done = gap <= 0.1 * tolerance * xp.where(scale > 0, scale, 1)
         # A Newton step that no longer helps has reached rounding, or is stuck: `finish` tells which by the residual.
         stalled = ~contracting & ~helps(M, gap)
         # A step of minimisation that widens the gap is taken back, and Newton goes on from where it started.
         widened = contracting & (state.steps > 0) & ~(gap < own.gap) & ~done
-        result = Result.where(done | stalled, Result.success, Result.running)
-        result = Result.where(finite | widened, result, Result.nonfinite)
+        result = choose(done | stalled, Result.success, Result.running)
+        result = choose(finite | widened, result, Result.nonfinite)
         good = finite & ~stalled & ~widened
         # Newton once, Newton to the end: a step of minimisation would expand what a good Newton step has shrunk.
         still = contracting & (ratio <= CONTRACTING)
-        following = _Own(response.M, gap, ratio, response.unique, response.residual, limit, still)
-        kept = jax.tree.map(lambda new, old: jnp.where(good, new, old), following, own)
+        kept = choose(good, _Own(response.M, gap, ratio, response.unique, limit, still), own)
         kept = eqx.tree_at(lambda k: k.contracting, kept, kept.contracting & ~widened)
-        return State(jnp.where(good, M, state.M), state.steps + 1, result, kept)
+        return State(choose(good, M, state.M), state.steps + 1, result, kept)
 
-    def finish(self, problem: PerformativeProblem, state: State, stopped: bool) -> tuple[Result, dict[str, Array]]:
-        tolerance = check_tolerance(self.tolerance, problem.dtype)
+    def finish(self, problem: PerformativeProblem, state: State, stopped: bool) -> tuple[Result, dict[str, Any]]:
+        residual = residual_of(problem, state.M, state.M)
         unfinished = Result.running if stopped else Result.not_converged
-        result = Result.where(
-            state.own.residual <= tolerance,
-            Result.success,
-            Result.where(state.result == Result.nonfinite, Result.nonfinite, unfinished),
-        )
-        return result, {"residual": state.own.residual, "unique": state.own.unique, "rate": state.own.ratio}
+        failed = choose(state.result == Result.nonfinite, Result.nonfinite, unfinished)
+        result = choose(residual <= check_tolerance(self.tolerance, problem.dtype), Result.success, failed)
+        return result, {"residual": residual, "unique": state.own.unique, "rate": state.own.ratio}
 
 
-def _newton_direction(problem: PerformativeProblem, M: Array, response: Array) -> Array:
-    """δ with (I - Φ'(M)) δ = Φ(M) - M, by GMRES; half a step of repeated minimisation where that fails."""
-    pushforward = response_pushforward(problem, M, response)
+def _newton_direction(problem: PerformativeProblem, M: Any, response: Any) -> Any:
+    """δ with (I - Φ'(M)) δ = Φ(M) - M; half a step of repeated minimisation where that fails."""
+    xp, _ = numerics(problem, M, response)
     F = response - M
+    if M.size > DENSE:
+        direction = _by_products(problem, M, response)
+    else:
+        system = xp.eye(M.size, dtype=M.dtype) - response_jacobian(problem, M, response)
+        direction = solve(system, F.reshape(-1)).reshape(M.shape)
+    return xp.where(xp.all(xp.isfinite(direction)), direction, F / 2)
+
+
+@program
+def _by_products(problem: PerformativeProblem, M: Any, response: Any) -> Array:
+    """The direction by GMRES, with products Φ'(M) V alone."""
+    pushforward = response_pushforward(problem, M, response)
     direction, _ = jax.scipy.sparse.linalg.gmres(
-        lambda V: V - pushforward(V), F, tol=1e-10, restart=min(KRYLOV, M.size), maxiter=4
+        lambda V: V - pushforward(V), response - M, tol=1e-10, restart=min(KRYLOV, M.size), maxiter=4
     )
-    return jnp.where(jnp.all(jnp.isfinite(direction)), direction, F / 2)
+    return jnp.asarray(direction)

@@ -24,13 +24,13 @@ from jaxtyping import Array
 
 from perfcontrol._checks import as_array, fail
 from perfcontrol.costs import QuadraticCost
-from perfcontrol.evaluate.best_response import respond
 from perfcontrol.evaluate.exact import exact_cost, exact_gradient
 from perfcontrol.perturbations import AbstractPerturbation, CovarianceOperator, DirectionalPerturbation, Draws
 from perfcontrol.perturbations.directional import DirectionalCovariance
 from perfcontrol.policy_maps import AbstractPolicyMap, Affine
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.random_vectors import Constant
+from perfcontrol.response import respond
 from perfcontrol.theory.certificate import Assumption, Certificate, not_applicable
 from perfcontrol.theory.existence import constant_mean, existence
 from perfcontrol.theory.local import DENSE_LIMIT, fixed_noise, tangent_basis

@@ -16,9 +16,10 @@ import numpy as np
 from jaxtyping import Array
 
 from perfcontrol._checks import InputError, check_integer, fail
-from perfcontrol.evaluate.best_response import respond
-from perfcontrol.evaluate.exact import expected_gradient, require_moments
+from perfcontrol.evaluate.cost_to_go import require_moments
+from perfcontrol.evaluate.exact import expected_gradient
 from perfcontrol.problem import PerformativeProblem
+from perfcontrol.response import respond
 from perfcontrol.solvers import AbstractSolver, Continuation, Result, Solution, StablePoint, solve
 from perfcontrol.theory.certificate import Assumption, Certificate, not_applicable
 from perfcontrol.theory.existence import existence, set_radius

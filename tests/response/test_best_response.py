@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import perfcontrol as pc
-from perfcontrol.evaluate.best_response import respond, response_pushforward
+from perfcontrol.response import respond, response_jacobian, response_pushforward
 from tests.evaluate.cases import affine_gradient, case, policies, random_psd, replaced, weights
 from tests.tools import assert_close, normal, tolerance
 
@@ -38,12 +38,12 @@ def make(noise=NOISE, feasible_set=None, **parts):
     return pc.PerformativeProblem(**(arguments | parts))
 
 
-compiled_respond = eqx.filter_jit(respond)
+traced_respond = eqx.filter_jit(respond)
 
 
 def answer(problem, deployed):
-    """Φ by the engine without its derivative, which compiles in half the time."""
-    return compiled_respond(problem, deployed).M
+    """Φ by the engine, worked out from the host."""
+    return respond(problem, deployed).M
 
 
 def dense_minimiser(problem, deployed, row_total=None):
@@ -69,7 +69,7 @@ ENUMERABLE = ["scalar with every mean", "everything varies", "everything varies,
 def test_separable_best_response_matches_dense_least_squares(name):
     problem = UNIQUE[name]()
     assert_close(answer(problem, DEPLOYED), dense_minimiser(problem, DEPLOYED), 1e-10)
-    assert bool(compiled_respond(problem, DEPLOYED).unique)
+    assert bool(respond(problem, DEPLOYED).unique)
 
 
 @pytest.mark.parametrize("name", ENUMERABLE)
@@ -146,7 +146,7 @@ SETS = {
 def test_constrained_best_response_matches_cvxpy_and_its_variational_inequality(name):
     feasible_set, constraints = SETS[name]
     problem = make(pc.Gaussian(np.array([0.5, -1.0, 2.0]), random_psd(102, n)), feasible_set)
-    response = compiled_respond(problem, DEPLOYED)
+    response = respond(problem, DEPLOYED)
     g, hessian = affine_gradient(problem, DEPLOYED)
     M = [cp.Variable((m, n)) for _ in range(H)]
     flat = cp.hstack([cp.vec(lag, order="C") for lag in M])
@@ -173,7 +173,7 @@ SINGULAR = pc.Gaussian(np.zeros(n), np.outer([1.0, 2.0, -1.0], [1.0, 2.0, -1.0])
 
 def test_best_response_is_the_least_norm_one_and_not_unique_when_the_noise_covariance_is_singular():
     problem = make(SINGULAR)
-    response = compiled_respond(problem, DEPLOYED)
+    response = respond(problem, DEPLOYED)
     assert not bool(response.unique)
     assert_close(response.M, dense_minimiser(problem, DEPLOYED), 1e-9)
     unexcited = np.linalg.svd(np.array([[1.0, 2.0, -1.0]]))[2][1:].T
@@ -183,21 +183,21 @@ def test_best_response_is_the_least_norm_one_and_not_unique_when_the_noise_covar
 def test_best_response_is_the_least_norm_one_when_a_recorded_disturbance_excites_little():
     c = case("recorded disturbance")
     problem = replaced(c.problem, noise=pc.Sequence(np.outer([1.0, -0.5, 2.0, 0.3], [1.0, 1.0])))
-    response = compiled_respond(problem, c.deployed)
+    response = respond(problem, c.deployed)
     assert not bool(response.unique)
     assert_close(response.M, dense_minimiser(problem, c.deployed), 1e-9)
 
 
 def test_row_sum_best_response_is_the_least_norm_one_when_the_noise_covariance_is_singular():
     problem = make(SINGULAR, pc.RowSum(0.7))
-    response = compiled_respond(problem, DEPLOYED)
+    response = respond(problem, DEPLOYED)
     assert not bool(response.unique)
     assert_close(response.M, dense_minimiser(problem, DEPLOYED, row_total=0.7), 1e-9)
 
 
 def test_simplex_best_response_is_told_not_unique_when_the_noise_is_a_single_direction():
     problem = make(SINGULAR, pc.RowSimplex(0.8))
-    response = compiled_respond(problem, DEPLOYED)
+    response = respond(problem, DEPLOYED)
     assert not bool(response.unique)
     assert float(pc.residual(problem, response.M, deployed=DEPLOYED)) < 1e-11
 
@@ -221,11 +221,24 @@ def compiled_pushforward(problem, deployed, response, V):
 def test_response_pushforward_matches_central_differences(name):
     problem = DIFFERENTIATED[name]()
     step = 1e-4
-    ahead, behind = (np.asarray(compiled_respond(problem, DEPLOYED + h * OTHER).M) for h in (step, -step))
+    ahead, behind = (np.asarray(respond(problem, DEPLOYED + h * OTHER).M) for h in (step, -step))
     difference = (ahead - behind) / (2 * step)
     assert np.abs(difference).max() > 1e-4, "the response does not move"
-    pushed = compiled_pushforward(problem, DEPLOYED, compiled_respond(problem, DEPLOYED).M, OTHER)
+    response = respond(problem, DEPLOYED).M
+    pushed = compiled_pushforward(problem, DEPLOYED, response, OTHER)
     np.testing.assert_allclose(pushed, difference, atol=2e-7 * (1 + np.abs(difference).max()))
+    matrix = response_jacobian(problem, np.asarray(DEPLOYED), response)
+    assert isinstance(matrix, np.ndarray)
+    np.testing.assert_allclose((matrix @ OTHER.reshape(-1)).reshape(OTHER.shape), pushed, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", DIFFERENTIATED)
+def test_best_response_inside_a_program_is_the_one_from_the_host(name):
+    problem = DIFFERENTIATED[name]()
+    from_host, traced = respond(problem, DEPLOYED), traced_respond(problem, DEPLOYED)
+    assert isinstance(from_host.M, np.ndarray) and isinstance(traced.M, jax.Array)
+    assert_close(traced.M, from_host.M, 1e-11)
+    assert bool(traced.unique) == bool(from_host.unique)
 
 
 @pytest.mark.parametrize("name", ["singular covariance", "row sums", "active ball"])
@@ -263,7 +276,7 @@ def test_best_response_works_under_vmap_over_deployed_policies():
 def test_best_response_without_a_dense_hessian_matches_the_dense_one(name, monkeypatch):
     problem = DIFFERENTIATED[name]()
     dense = answer(problem, DEPLOYED)
-    monkeypatch.setattr(importlib.import_module("perfcontrol.evaluate.best_response"), "DENSE_LIMIT", 1)
+    monkeypatch.setattr(importlib.import_module("perfcontrol.response.quadratic"), "DENSE_LIMIT", 1)
     iterative = eqx.filter_jit(lambda problem, M: respond(problem, M).M)(problem, DEPLOYED)
     assert_close(iterative, dense, 1e-9)
 

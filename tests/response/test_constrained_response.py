@@ -8,7 +8,8 @@ import pytest
 import scipy.optimize
 
 import perfcontrol as pc
-from perfcontrol.evaluate.best_response import Quadratic, _Projected
+from perfcontrol.response.projected import Projected
+from perfcontrol.response.quadratic import Quadratic
 from tests.oracles.enumeration import enumerate_cost
 from tests.tools import assert_close, normal
 
@@ -126,10 +127,8 @@ def _minimise(quadratic_form, linear, ball):
     linear = linear.reshape(problem.policy_shape)
     step = 1 / jnp.linalg.norm(quadratic_form, 2)
 
-    def gradient(M):
-        return linear + (quadratic_form @ M.reshape(-1)).reshape(M.shape)
-
-    M, unique = _Projected(problem, Quadratic(linear, gradient, step, quadratic_form)).minimise(jnp.zeros_like(linear))
+    form = Quadratic(linear, step, quadratic_form)
+    M, unique = Projected(problem.feasible_set, form).minimise(jnp.zeros_like(linear))
     return M.reshape(-1), unique
 
 

@@ -1,0 +1,144 @@
+"""The world that a deployed policy makes, as a cost-to-go: one recursion backward in time, on z = [x; u].
+
+    Γ_t = C_t + Ā_tᵀ Λ_{t+1} Ā_t + 𝒞_t*[Λ_{t+1}],     Ā_t = [A_t, B_t] + Θ_t,
+    [[Λ_t, D_tᵀ], [D_t, S_t]] = Γ_t seen through u = v - K_t x,
+
+where C_t is the stage weight, Θ_t = E Δ_t and 𝒞_t*[X] = E (Δ-Θ)ᵀX(Δ-Θ). The closed loop does not depend on the
+evaluated policy, so neither does any of this: costs, gradients, best responses and residuals share it.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from perfcontrol._checks import fail
+from perfcontrol._linalg import Matrix, along_time, as_dense, congruence, symmetrise, transpose
+from perfcontrol._programs import program
+from perfcontrol.costs import QuadraticCost
+from perfcontrol.perturbations import CovarianceOperator
+from perfcontrol.problem import PerformativeProblem
+
+SIMULATE = "Use pc.estimate_cost and pc.sample_gradient, which only simulate."
+
+
+class CostToGo(eqx.Module):
+    """What the deployed policy makes of the world; none of it depends on the evaluated policy.
+
+    Lambda: (T+1, n, n) cost-to-go. S: (T+1, m, m) curvature in the feedforward v_t. D: (T+1, m, n) its coupling to
+    the state. R, N: the parts of S and D that are not BᵀΛB and BᵀΛF: stage cost and perturbation of the input; with
+    the axis T+1 where they vary, N None where there is no coupling. F: (n, n) mean closed loop, B: (n, m) mean input
+    matrix, Θ included; with the axis T where they vary. noise_mean: (n,) or (T, n) and noise_covariance: (n, n) or
+    (T, n, n), of the law of w_t.
+    """
+
+    Lambda: Float[Array, "T1 n n"]
+    R: Float[Array, "*steps m m"]
+    N: Float[Array, "*steps m n"] | None
+    S: Float[Array, "T1 m m"]
+    D: Float[Array, "T1 m n"]
+    F: Matrix
+    B: Matrix
+    noise_mean: Float[Array, "*time n"]
+    noise_covariance: Float[Array, "*times n n"]
+
+
+def require_moments(problem: PerformativeProblem) -> None:
+    """Raise unless the cost is what exact evaluation needs; of the perturbation, `known_covariance` says."""
+    if not isinstance(problem.cost, QuadraticCost):
+        raise fail("cost", type(problem.cost).__name__, "be a QuadraticCost for exact evaluation", SIMULATE)
+
+
+def known_covariance(problem: PerformativeProblem, reacting: Array) -> CovarianceOperator:
+    """The covariance operator of the perturbation; raises where the law does not know it."""
+    spread = problem.perturbation.covariance(reacting, problem.horizon)
+    if spread is None:
+        raise fail(
+            "perturbation",
+            f"{type(problem.perturbation).__name__} without known moments",
+            "know its mean and covariance for exact evaluation",
+            SIMULATE,
+        )
+    return spread
+
+
+def _stage_weights(problem: PerformativeProblem) -> tuple[Array, Array | None, Array]:
+    """The stage weight seen through u = v - K x: on x, (n, n); between v and x, (m, n), None for zero; on v, (m, m).
+
+    Each with a leading axis T+1 where it varies in time.
+    """
+    cost = problem.cost
+    assert isinstance(cost, QuadraticCost)
+    Q, R, cross = cost.Q, cost.R, cost.cross
+    between = None if cross is None else transpose(cross)
+    if not problem.has_gain:
+        return Q, between, R
+    K = problem.gain
+    on_x = Q + transpose(K) @ R @ K
+    if between is None:
+        return on_x, -R @ K, R
+    mixed = transpose(K) @ between
+    return on_x - mixed - transpose(mixed), between - R @ K, R
+
+
+def cost_to_go(problem: PerformativeProblem, reacting: Array) -> CostToGo:
+    """The backward recursion under the lifted deployed policy `reacting`."""
+    n, m, T = problem.state_size, problem.input_size, problem.horizon
+    on_x, between, on_v = _stage_weights(problem)
+    A, B = problem.system.A, problem.system.B
+    on_input = problem.perturbation.columns(n, m) > n
+    Theta = problem.perturbation.mean_operator(reacting, T)
+    if Theta is not None and on_input:
+        joint = as_dense(Theta)
+        A, B = A + joint[..., :n], B + joint[..., n:]
+    elif Theta is not None:
+        A = A + Theta
+    F = problem.closed_loop(A, B)
+    varying = F.ndim == 3
+    spread = known_covariance(problem, reacting)
+    K = problem.gains()[:-1]
+    state_part = jnp.concatenate([jnp.broadcast_to(jnp.eye(n, dtype=K.dtype), (T, n, n)), -K], axis=1)
+
+    spread_steps, backward = (spread.steps, None) if varying or on_input else spread.backward(F)
+
+    def retreat(Lambda: Array, step: Any) -> tuple[Array, Array]:
+        F_t, stage_t, spread_t, state_part_t = step
+        if backward is not None:
+            moved = backward(spread_t, Lambda)
+        else:
+            reaction = spread.adjoint_step(spread_t, Lambda)
+            moved = congruence(F_t if varying else F, Lambda)
+            moved = moved + (congruence(state_part_t, reaction) if on_input else reaction)
+        previous = (on_x if stage_t is None else stage_t) + moved
+        return previous, previous
+
+    last = symmetrise(on_x if on_x.ndim == 2 else on_x[-1])
+    stages = on_x[:-1] if on_x.ndim == 3 else None
+    steps = (F if varying else None, stages, spread_steps, state_part if on_input else None)
+    _, earlier = jax.lax.scan(retreat, last, steps, reverse=True)
+    Lambda = jnp.concatenate([earlier, last[None]])
+    if on_input:
+        reaction = spread.adjoint(Lambda[1:])[:, n:, :]
+        last_stage = ((0, 1), (0, 0), (0, 0))  # nothing reacts after it
+        on_v = on_v + jnp.pad(reaction[:, :, n:], last_stage)
+        between = jnp.pad(reaction @ state_part, last_stage) + (0 if between is None else between)
+    # What couples to v needs no recursion: in bulk over time.
+    pulled = transpose(Lambda[1:] @ B)
+
+    def with_stage(stage: Array | None, moved: Array) -> Array:
+        if stage is None:
+            return jnp.pad(moved, ((0, 1), (0, 0), (0, 0)))
+        stages: Array = along_time(stage, 2, T + 1)
+        return jnp.concatenate([stages[:-1] + moved, stages[-1:]])
+
+    S, D = with_stage(on_v, pulled @ B), with_stage(between, pulled @ F)
+    noise = problem.noise_under(reacting)
+    return CostToGo(Lambda, on_v, between, S, D, F, B, noise.mean, noise.covariance)
+
+
+@program
+def world_of(problem: PerformativeProblem, deployed: Any) -> CostToGo:
+    """`cost_to_go` of the deployed policy's free parameters."""
+    return cost_to_go(problem, problem.structure.lift(deployed))

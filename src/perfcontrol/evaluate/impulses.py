@@ -1,0 +1,118 @@
+"""What the impulses w_s cost: quadratic forms in [I; M̂] with blocks S and D F⋯F B, summed over s.
+
+Nothing is quadratic in the horizon: where F and B are constant the sums over time are taken before the products.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from perfcontrol._linalg import Matrix, along_time, as_dense, transpose
+from perfcontrol.evaluate.cost_to_go import CostToGo
+
+
+class ImpulseForm(eqx.Module):
+    """Σ_s of the quadratic forms that impulses w_s meet, for noise whose covariance is constant.
+
+    G: (H m, H m), F: (H m, n), a: (n, n): cost tr Σ (a + FᵀM̂ + M̂ᵀF + M̂ᵀG M̂), M̂ the (H m, n) stack of lags.
+    """
+
+    G: Float[Array, "Hm Hm"]
+    F: Float[Array, "Hm n"]
+    a: Float[Array, "n n"]
+
+
+def _chains(world: CostToGo, memory: int) -> tuple[list[Array], list[Array]]:
+    """Y[d]_t = D_t F_{t-1} ⋯ F_{t-d}, (H, T+1, m, n), and X[d]_t, the block coupling lags j and j-d at t = s+j.
+
+    X[0] = S and X[d] = Y[d-1]_t B_{t-d}, (H, T+1, m, m); zero where t < d.
+    """
+    length = world.S.shape[0]
+
+    def shifted(matrices: Matrix, d: int) -> Matrix:
+        """matrices_{t-d} for t = 0..T, zero where t < d."""
+
+        def shift(array: Array) -> Array:
+            return jnp.concatenate([jnp.zeros((d, *array.shape[1:]), array.dtype), array])[:length]
+
+        return jax.tree.map(shift, along_time(matrices, 2, length - 1))
+
+    Y, X = [world.D], [world.S]
+    for d in range(1, memory):
+        X.append(Y[-1] @ shifted(world.B, d))
+        Y.append(Y[-1] @ shifted(world.F, d))
+    return Y, X
+
+
+def tail_sums(matrices: Array, memory: int, length: int) -> Array:
+    """Σ_{t ≥ j} of matrices_t for j = 1..memory, t up to length - 1; without a time axis, the same at every t."""
+    if matrices.ndim == 2:
+        return jnp.arange(length - 1, length - 1 - memory, -1, dtype=matrices.dtype)[:, None, None] * matrices
+    parts = jnp.concatenate([matrices[1:memory], jnp.sum(matrices[memory:], axis=0)[None]])
+    return jnp.flip(jnp.cumsum(jnp.flip(parts, axis=0), axis=0), axis=0)
+
+
+def _chain_tails(world: CostToGo, memory: int) -> tuple[Array, Array]:
+    """Σ_{t ≥ j} X[d]_t at index [d, j-1], (H, H, m, m), and Σ_{t > d} Y[d]_t, (H, m, n)."""
+    length = world.S.shape[0]
+    if world.F.ndim == 3 or world.B.ndim == 3:
+        Y, X = _chains(world, memory)
+        # Y[d]_t is zero for t < d, and t = d would be the impulse w_{-1}.
+        over_time = jnp.stack([jnp.sum(y[d + 1 :], axis=0) for d, y in enumerate(Y)])
+        return jnp.stack([tail_sums(x, memory, length) for x in X]), over_time
+    # The same matrices at every time: the sums come first, and nothing but Λ needs a pass over time.
+    F, B = as_dense(world.F), as_dense(world.B)
+    pulled = transpose(B) @ tail_sums(world.Lambda[1:], memory, length - 1)
+    curvature = pulled @ B + tail_sums(world.R, memory, length)
+    coupling = pulled @ F if world.N is None else pulled @ F + tail_sums(world.N, memory, length)
+    Y, X = [coupling], [curvature]
+    for _ in range(1, memory):
+        X.append(Y[-1] @ B)
+        Y.append(Y[-1] @ F)
+    return jnp.stack(X), jnp.stack([y[d] for d, y in enumerate(Y)])
+
+
+def impulse_form(world: CostToGo, memory: int) -> ImpulseForm:
+    """The blocks summed over impulses, by tail sums over time."""
+    m = world.S.shape[-1]
+    X, Y = _chain_tails(world, memory)
+    row, column = jnp.meshgrid(jnp.arange(memory), jnp.arange(memory), indexing="ij")
+    blocks = X[jnp.abs(row - column), jnp.maximum(row, column)]
+    blocks = jnp.where((row >= column)[..., None, None], blocks, transpose(blocks))
+    G = blocks.transpose(0, 2, 1, 3).reshape(memory * m, memory * m)
+    return ImpulseForm(G, Y.reshape(memory * m, -1), jnp.sum(world.Lambda[1:], axis=0))
+
+
+def varying_impulses(world: CostToGo, M: Array, covariance: Array) -> tuple[Array, Array]:
+    """Cost and gradient (H, m, n) of the impulses where the noise covariance (T, n, n) varies in time."""
+    memory = M.shape[0]
+    T = covariance.shape[0]
+    Y, X = _chains(world, memory)
+
+    def spread(array: Array, j: int) -> Array:
+        """array_{s+j} for s = 0..T-1, zero past T."""
+        pad = jnp.zeros((memory, *array.shape[1:]), array.dtype)
+        return jnp.concatenate([array, pad])[j : j + T]
+
+    fed = [M[i] @ covariance for i in range(memory)]  # M_i Σ_s
+    linear = [jnp.einsum("tmn,tnk->mk", spread(Y[j - 1], j), covariance) for j in range(1, memory + 1)]
+    curved = [jnp.zeros_like(M[0]) for _ in range(memory)]
+    for j in range(1, memory + 1):
+        for d in range(j):
+            block = spread(X[d], j)
+            curved[j - 1] += jnp.einsum("tab,tbn->an", block, fed[j - 1 - d])
+            if d:
+                curved[j - 1 - d] += jnp.einsum("tba,tbn->an", block, fed[j - 1])
+    linear_all, curved_all = jnp.stack(linear), jnp.stack(curved)
+    constant = jnp.einsum("tij,tji->", world.Lambda[1:], covariance)
+    return constant + jnp.sum(M * (2 * linear_all + curved_all)), 2 * (linear_all + curved_all)
+
+
+def constant_impulses(world: CostToGo, M: Array, covariance: Array) -> tuple[Array, Array]:
+    """Cost and gradient (H, m, n) of the impulses where the noise covariance (n, n) is constant."""
+    form = impulse_form(world, M.shape[0])
+    stacked = M.reshape(-1, M.shape[-1])
+    curved = form.G @ stacked
+    cost = jnp.sum(covariance * (form.a + transpose(stacked) @ (2 * form.F + curved)))
+    return cost, (2 * (form.F + curved) @ covariance).reshape(M.shape)

@@ -1,0 +1,80 @@
+"""What the deterministic part costs: the path of the means of noise, feedforward and initial state.
+
+Λ carries the multiplicative noise that the mean path excites.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from perfcontrol._linalg import along_time, as_dense, matvec, rmatvec
+from perfcontrol.costs import QuadraticCost
+from perfcontrol.evaluate.cost_to_go import CostToGo
+from perfcontrol.evaluate.impulses import tail_sums
+from perfcontrol.evaluate.rollout import input_adjoint, input_term
+from perfcontrol.problem import PerformativeProblem
+
+
+def mean_path(problem: PerformativeProblem, world: CostToGo, v: Array, w: Array, x0: Array) -> tuple[Array, Array]:
+    """Expected cost of the deterministic part v (T+1, m), w (T, n), x_0, and its gradient by v, (T+1, m).
+
+    The multiplicative noise that the mean path excites is included: Λ carries it.
+    """
+    n, T = problem.state_size, problem.horizon
+    cost = problem.cost
+    assert isinstance(cost, QuadraticCost)
+    push = input_term(world.B, v) + w
+    moved = matvec(world.Lambda[1:], push)
+    source, by_input_stage, constant = jnp.zeros((T + 1, n), v.dtype), 0, 0
+    if cost.has_targets:
+        linear, constant = cost.linear_terms(T)
+        by_input_stage = linear[:, n:]
+        source = linear[:, :n] - problem.feedback_adjoint(by_input_stage)
+    if world.N is not None:
+        source = source + (v @ world.N if world.N.ndim == 2 else rmatvec(world.N, v))
+    varying = world.F.ndim == 3
+    F = world.F if varying else None
+
+    def retreat(p: Array, step: Any) -> tuple[Array, Array]:
+        F_t, source_t, moved_t = step
+        return source_t + rmatvec(F_t if varying else world.F, moved_t + p), p
+
+    p0, p_next = jax.lax.scan(retreat, source[-1], (F, source[:-1], moved), reverse=True)
+
+    def advance(mu: Array, step: Any) -> tuple[Array, Array]:
+        F_t, push_t = step
+        following = matvec(F_t if varying else world.F, mu) + push_t
+        return following, following
+
+    _, mu = jax.lax.scan(advance, x0, (F, push))
+    # x' Λ x + 2 p' x is what lies ahead: each push adds its own to it, and by_v is what it adds at the margin.
+    total = x0 @ (world.Lambda[0] @ x0 + 2 * p0) + jnp.sum(push * (moved + 2 * p_next)) + jnp.sum(constant)
+    weighed = v @ world.R if world.R.ndim == 2 else matvec(world.R, v)
+    total = total + jnp.sum(v * (weighed + 2 * by_input_stage))
+    margin = input_adjoint(world.B, matvec(world.Lambda[1:], mu) + p_next)
+    by_v = weighed + by_input_stage + jnp.pad(margin, ((0, 1), (0, 0)))
+    if world.N is not None:
+        states = jnp.concatenate([x0[None], mu])
+        by_v = by_v + (states @ world.N.T if world.N.ndim == 2 else matvec(world.N, states))
+    return total, 2 * by_v
+
+
+def sustained_form(world: CostToGo, memory: int) -> Array:
+    """(H m, H m): the quadratic form that constant feedforwards ṽ_i, held from time i on, meet (i = 1..H)."""
+    length, m = world.S.shape[0], world.S.shape[-1]
+    active = (jnp.arange(length)[:, None] >= jnp.arange(1, memory + 1)).astype(world.S.dtype)  # (T+1, H)
+    B = as_dense(along_time(world.B, 2, length - 1))
+    push = (B[:, :, None, :] * active[:-1, None, :, None]).reshape(length - 1, B.shape[1], memory * m)
+    varying = world.F.ndim == 3
+
+    def advance(X: Array, step: Any) -> tuple[Array, Array]:
+        F_t, push_t = step
+        return (F_t if varying else world.F) @ X + push_t, X
+
+    last, X = jax.lax.scan(advance, jnp.zeros_like(push[0]), (world.F if varying else None, push))
+    states = jnp.concatenate([X, last[None]])  # X_t: the state that the columns of ṽ have led to
+    coupled = tail_sums(world.D @ states, memory, length).reshape(memory * m, memory * m)
+    held = tail_sums(world.S, memory, length)[jnp.maximum(*jnp.indices((memory, memory)))]
+    return coupled + coupled.T + held.transpose(0, 2, 1, 3).reshape(memory * m, memory * m)

@@ -1,0 +1,162 @@
+"""Best response on a general convex set: accelerated projected gradient steps, then semismooth Newton steps.
+
+Newton works on the natural residual θ - Proj(θ - η g) through the derivative of the projection.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from perfcontrol._linalg import frobenius, solve
+from perfcontrol._programs import numerics, program
+from perfcontrol.response.quadratic import Operator, Quadratic
+from perfcontrol.sets import AbstractSet, Unconstrained
+
+ACCELERATED_STEPS = 400
+NEWTON_STEPS = 30
+
+
+@program
+def projection_slope(feasible_set: AbstractSet, point: Any) -> Array:
+    """The derivative (p, p) of the projection at `point` (policy_shape)."""
+    size = point.size
+    slope = jax.jacfwd(feasible_set.project)(point)
+    return slope.reshape(size, size)
+
+
+@program
+def _project(feasible_set: AbstractSet, M: Any) -> Array:
+    return feasible_set.project(M)
+
+
+def nearest(feasible_set: AbstractSet, M: Any) -> Any:
+    """The nearest policy of the set."""
+    return M if isinstance(feasible_set, Unconstrained) else _project(feasible_set, M)
+
+
+class Projected:
+    """The quadratic on a convex set."""
+
+    def __init__(self, feasible_set: AbstractSet, form: Quadratic):
+        self.feasible_set, self.form, self.step = feasible_set, form, form.step
+
+    def minimise(self, start: Any) -> tuple[Any, Any]:
+        """The minimiser, and whether it is the only one."""
+        if self.form.matrix is None:
+            return _approach_by_gradients(self.feasible_set, self.form, start), jnp.asarray(True)
+        return _minimise(self.feasible_set, self.form, start)
+
+    def newton(self, M: Any) -> Operator:
+        """gradient -> the Newton step from near the minimiser M."""
+        project, step = self.feasible_set.project, self.step
+        if self.form.matrix is None:
+            return lambda gradient: project(M - step * gradient) - M
+        system, _ = _newton_system(self.feasible_set, self.form, M)
+        factors = jax.scipy.linalg.lu_factor(system)
+
+        def solve(gradient: Array) -> Array:
+            moved = M - project(M - step * gradient)
+            return -jax.scipy.linalg.lu_solve(factors, moved.reshape(-1)).reshape(M.shape)
+
+        return solve
+
+    def jacobian(self, M: Any, reaction: Any) -> Any:
+        """Φ', (p, p), given 𝐄 = ∂_2 g, (p, p): the Newton step differentiated in its gradient."""
+        system, slope = _newton_system(self.feasible_set, self.form, M)
+        return -solve(system, self.step * slope @ reaction)
+
+
+def _newton_system(feasible_set: AbstractSet, form: Quadratic, M: Any) -> tuple[Any, Any]:
+    """A generalised Jacobian (p, p) of the natural residual, and the slope of the projection in it.
+
+    A shift by rounding keeps a singular one (a minimiser that is not unique) solvable.
+    """
+    xp, _ = numerics(form, M)
+    slope = projection_slope(feasible_set, M - form.step * form.gradient(M))
+    eye = xp.eye(len(slope), dtype=slope.dtype)
+    return (1 + xp.finfo(slope.dtype).eps) * eye - slope @ (eye - form.step * form.matrix), slope
+
+
+@program
+def _minimise(feasible_set: AbstractSet, form: Quadratic, start: Array) -> tuple[Array, Array]:
+    eps = float(jnp.finfo(start.dtype).eps)
+
+    def unsolved(carry: Any) -> Array:
+        M, gap, *_, tolerance = carry
+        return (gap > 4 * eps * _scale(form, M)) & (tolerance > eps)
+
+    def approach(carry: Any) -> Any:
+        # Newton may stall on the wrong face, from where no step of its own helps: then gradient steps again.
+        M, *_, tolerance = carry
+        M, gap, system = _newton_steps(
+            feasible_set, form, _accelerated(feasible_set, form, M, tolerance, ACCELERATED_STEPS)
+        )
+        return M, gap, system, 1e-3 * tolerance
+
+    far = jnp.asarray(jnp.inf, start.dtype)
+    eye = jnp.eye(start.size, dtype=start.dtype)
+    first = (feasible_set.project(start), far, eye, jnp.asarray(1e-5, start.dtype))
+    M, _, system, _ = jax.lax.while_loop(unsolved, approach, first)
+    # On the active face the Hessian must be definite: the Jacobian has full rank.
+    values = jnp.linalg.eigvalsh(system @ system.T)
+    return M, values[0] > (M.size * eps * 100) ** 2 * jnp.maximum(values[-1], 1)
+
+
+def _approach_by_gradients(feasible_set: AbstractSet, form: Quadratic, start: Array) -> Array:
+    """Gradient steps alone, where the Hessian is not held."""
+    eps = float(jnp.finfo(start.dtype).eps)
+    return _accelerated(feasible_set, form, feasible_set.project(start), 40 * eps, 50 * ACCELERATED_STEPS)
+
+
+def _natural_gap(feasible_set: AbstractSet, form: Quadratic, M: Array) -> Array:
+    return M - feasible_set.project(M - form.step * form.gradient(M))
+
+
+def _newton_steps(feasible_set: AbstractSet, form: Quadratic, M: Array) -> tuple[Array, Array, Array]:
+    """Semismooth Newton steps while they help, the natural residual that they reach, its Jacobian."""
+    eps = float(jnp.finfo(M.dtype).eps)
+
+    def improve(carry: Any) -> Any:
+        M, gap, count, *_ = carry
+        residual = _natural_gap(feasible_set, form, M)
+        system, _ = _newton_system(feasible_set, form, M)
+        newton = feasible_set.project(M - jnp.linalg.solve(system, residual.reshape(-1)).reshape(M.shape))
+        candidates = jnp.stack([newton, M - residual])  # a gradient step where Newton is not finite
+        gaps = jax.vmap(lambda candidate: frobenius(_natural_gap(feasible_set, form, candidate)))(candidates)
+        best = jnp.where(gaps[0] <= gaps[1], 0, 1)
+        improved = gaps[best] < gap
+        return jnp.where(improved, candidates[best], M), jnp.minimum(gaps[best], gap), count + 1, ~improved, system
+
+    def helping(carry: Any) -> Array:
+        M, gap, count, stuck, _ = carry
+        return (count == 0) | ((gap > 4 * eps * _scale(form, M)) & (count < NEWTON_STEPS) & ~stuck)
+
+    gap = frobenius(_natural_gap(feasible_set, form, M))
+    eye = jnp.eye(M.size, dtype=M.dtype)
+    M, gap, *_, system = jax.lax.while_loop(helping, improve, (M, gap, jnp.asarray(0), jnp.asarray(False), eye))
+    return M, gap, system
+
+
+def _scale(form: Quadratic, M: Array) -> Array:
+    return frobenius(M) + form.step * frobenius(form.linear) + jnp.finfo(M.dtype).tiny
+
+
+def _accelerated(feasible_set: AbstractSet, form: Quadratic, start: Array, tolerance: Any, limit: int) -> Array:
+    """Projected gradient steps with momentum, restarted when it points uphill."""
+
+    def accelerate(carry: Any) -> Any:
+        M, ahead, momentum, count, _ = carry
+        following = feasible_set.project(ahead - form.step * form.gradient(ahead))
+        grown = (1 + jnp.sqrt(1 + 4 * momentum**2)) / 2
+        uphill = jnp.sum((ahead - following) * (following - M)) > 0
+        ahead_next = following + jnp.where(uphill, 0, (momentum - 1) / grown) * (following - M)
+        return following, ahead_next, jnp.where(uphill, 1, grown), count + 1, frobenius(following - ahead)
+
+    def unfinished(carry: Any) -> Array:
+        M, _, _, count, moved = carry
+        return (moved > tolerance * _scale(form, M)) & (count < limit)
+
+    one, far = jnp.ones((), start.dtype), jnp.asarray(jnp.inf, start.dtype)
+    return jax.lax.while_loop(unfinished, accelerate, (start, start, one, jnp.asarray(0), far))[0]

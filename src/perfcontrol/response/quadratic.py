@@ -1,0 +1,124 @@
+"""C_T(·; M') as a convex quadratic in the free parameters θ, with gradient linear + 𝐇 θ."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from perfcontrol._linalg import symmetrise
+from perfcontrol._programs import Numbers, program
+from perfcontrol.evaluate.cost_to_go import CostToGo
+from perfcontrol.evaluate.exact import weigh
+from perfcontrol.evaluate.impulses import impulse_form
+from perfcontrol.evaluate.mean_path import sustained_form
+from perfcontrol.problem import PerformativeProblem
+
+DENSE_LIMIT = 2048  # free parameters up to which the Hessian is held as a matrix
+
+Operator = Callable[[Any], Any]
+
+
+class Quadratic(eqx.Module):
+    """gradient(θ) = linear + 𝐇 θ.
+
+    linear: policy_shape. step: η = 1/‖𝐇‖. matrix: 𝐇, (p, p), where held; else `passes` gives gradients by passes
+    over time.
+    """
+
+    linear: Numbers
+    step: Numbers
+    matrix: Numbers | None
+    passes: Operator | None = None
+
+    def gradient(self, M: Any) -> Any:
+        """The gradient at M: a product with the matrix where that is held, else a pass over time."""
+        if self.matrix is None:
+            assert self.passes is not None
+            return self.passes(M)
+        return self.linear + (self.matrix @ M.reshape(-1)).reshape(M.shape)
+
+
+def stationary(world: CostToGo) -> bool:
+    """Whether noise mean and covariance are constant in time (known from shapes)."""
+    return world.noise_mean.ndim == 1 and world.noise_covariance.ndim == 2
+
+
+@program
+def curvature(problem: PerformativeProblem, world: CostToGo) -> tuple[Array, Array]:
+    """G and G̃, (H m, H m): for constant noise moments the Hessian is 2 (G ⊗ Σ + G̃ ⊗ w̄w̄ᵀ) in the lifted policy."""
+    return impulse_form(world, problem.memory).G, sustained_form(world, problem.memory)
+
+
+@program
+def quadratic(problem: PerformativeProblem, world: CostToGo) -> Quadratic:
+    """The quadratic of a given world, its Hessian as a matrix."""
+    zero = jnp.zeros(problem.policy_shape, world.S.dtype)
+    linear = weigh(problem, world, zero)[1]
+    matrix = _hessian_matrix(problem, world, linear)
+    return Quadratic(linear, 1 / _largest_eigenvalue(matrix), matrix)
+
+
+def quadratic_by_passes(problem: PerformativeProblem, world: CostToGo) -> Quadratic:
+    """The same without a matrix."""
+
+    def gradient(M: Array) -> Array:
+        return weigh(problem, world, M)[1]
+
+    linear = gradient(jnp.zeros(problem.policy_shape, world.S.dtype))
+    return Quadratic(linear, 1 / _power_iteration(gradient, linear), None, gradient)
+
+
+def _hessian_matrix(problem: PerformativeProblem, world: CostToGo, linear: Array) -> Array:
+    """The Hessian in the free parameters (p, p)."""
+    size = linear.size
+    if stationary(world):
+        H, m, _ = problem.lifted_shape
+        w = world.noise_mean
+        blocks = jnp.stack(curvature(problem, world)).reshape(2, H, m, H, m)
+        right = jnp.stack([world.noise_covariance, jnp.outer(w, w)])
+
+        def column(direction: Array) -> Array:
+            V = problem.structure.lift(direction.reshape(linear.shape))
+            image = jnp.einsum("kimjl,jln,kno->imo", blocks, V, right, optimize="optimal")
+            return 2 * problem.structure.adjoint(image).reshape(-1)
+
+    else:
+
+        def column(direction: Array) -> Array:
+            return (weigh(problem, world, direction.reshape(linear.shape))[1] - linear).reshape(-1)
+
+    return symmetrise(jax.lax.map(column, jnp.eye(size, dtype=linear.dtype), batch_size=min(64, size)))
+
+
+def _largest_eigenvalue(matrix: Array) -> Array:
+    """An upper bound within rounding of ‖matrix‖ for a PSD matrix by power iteration on it, never zero."""
+    tiny = jnp.finfo(matrix.dtype).tiny
+
+    def improve(_: Any, v: Array) -> Array:
+        v = matrix @ v
+        return v / jnp.maximum(jnp.linalg.norm(v), tiny)
+
+    start = jnp.sqrt(jnp.sum(matrix**2, axis=0)) + tiny
+    v = jax.lax.fori_loop(0, 30, improve, start / jnp.linalg.norm(start))
+    # 30 steps may stop below the norm: a tenth more keeps projected gradient steps stable.
+    estimate = 1.1 * (v @ matrix @ v)
+    return jnp.maximum(jnp.minimum(estimate, jnp.trace(matrix)), tiny * matrix.shape[0])
+
+
+def _power_iteration(gradient: Operator, linear: Array) -> Array:
+    """The same estimate where only products are available."""
+    tiny = jnp.finfo(linear.dtype).tiny
+
+    def improve(_: Any, carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        v, _norm = carry
+        image = gradient(v) - linear
+        norm = jnp.sqrt(jnp.sum(image**2))
+        return image / jnp.maximum(norm, tiny), norm
+
+    start = jnp.ones_like(linear) / math.sqrt(linear.size)
+    _, norm = jax.lax.fori_loop(0, 50, improve, (start, jnp.zeros((), linear.dtype)))
+    return jnp.maximum(1.2 * norm, tiny)

@@ -1,0 +1,199 @@
+"""The best response Φ(M') = argmin over the feasible set of C_T(·; M'), exactly, for quadratic stage costs.
+
+C_T(·; M') is a convex quadratic in the free parameters. One engine serves best responses, repeated minimisation,
+stable points and theory; by the kind of problem it is `Separable`, `Affine` or `Projected`. Iterations run on frozen
+numbers; the derivative of Φ comes from one Newton step at the minimiser (implicit function theorem), never from
+differentiating a loop.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from perfcontrol._checks import check_finite
+from perfcontrol._linalg import frobenius
+from perfcontrol._programs import known, numerics, on_host, program
+from perfcontrol.evaluate.cost_to_go import CostToGo, require_moments, world_of
+from perfcontrol.evaluate.exact import exact_gradient, weigh
+from perfcontrol.evaluate.reaction import reaction_jacobian
+from perfcontrol.evaluate.rollout import check_pair
+from perfcontrol.problem import PerformativeProblem
+from perfcontrol.response import quadratic as quadratics
+from perfcontrol.response.affine import Affine, AffineByProducts
+from perfcontrol.response.projected import Projected, nearest
+from perfcontrol.response.quadratic import Operator, Quadratic, curvature, quadratic, quadratic_by_passes, stationary
+from perfcontrol.response.separable import Separable
+from perfcontrol.sets import FullStructure, Unconstrained
+
+Method = Affine | AffineByProducts | Projected | Separable
+
+
+class Response(NamedTuple):
+    """A best response M (of least norm on affine sets; NaN where the world overflows), and whether it is the only
+    one."""
+
+    M: Any
+    unique: Any
+
+
+def _held(problem: PerformativeProblem) -> bool:
+    """Whether the Hessian is held as a matrix."""
+    return math.prod(problem.policy_shape) <= quadratics.DENSE_LIMIT
+
+
+def _separable(problem: PerformativeProblem, world: CostToGo) -> bool:
+    free = isinstance(problem.feasible_set, Unconstrained) and isinstance(problem.structure, FullStructure)
+    return free and stationary(world)
+
+
+def _shape_of_cost(problem: PerformativeProblem, world: CostToGo) -> Any:
+    """What the methods need to know of the quadratic; finite unless the world overflows."""
+    if _separable(problem, world):
+        return curvature(problem, world)
+    return quadratic(problem, world) if _held(problem) else quadratic_by_passes(problem, world)
+
+
+def _method(problem: PerformativeProblem, world: CostToGo, form: Any) -> Method:
+    """The cheapest method that is exact for this kind of problem; known from types and shapes alone."""
+    if not isinstance(form, Quadratic):
+        return _separable_method(problem, world, form)
+    if problem.feasible_set.affine:
+        return (Affine if _held(problem) else AffineByProducts)(problem.feasible_set, form)
+    return Projected(problem.feasible_set, form)
+
+
+def _separable_method(problem: PerformativeProblem, world: CostToGo, curvatures: Any) -> Separable:
+    def dense() -> Affine | AffineByProducts:
+        if _held(problem):
+            return Affine(problem.feasible_set, quadratic(problem, world))
+        return AffineByProducts(problem.feasible_set, quadratic_by_passes(problem, world))
+
+    def gradient(M: Any) -> Any:
+        return weigh(problem, world, M)[1]
+
+    noise = world.noise_covariance, world.noise_mean
+    return Separable(curvatures, *noise, gradient, problem.lifted_shape, dense)
+
+
+def _sound(form: Any) -> Any:
+    xp, _ = numerics(form)
+    leaves = [leaf for leaf in jax.tree.leaves(form) if not callable(leaf)]
+    return xp.all(xp.stack([xp.all(xp.isfinite(leaf)) for leaf in leaves]))
+
+
+def _respond(problem: PerformativeProblem, deployed: Any, start: Any) -> Response:
+    world = world_of(problem, deployed)
+    form = _shape_of_cost(problem, world)
+    xp, _ = numerics(form, start)
+    sound = _sound(form)
+    if known(sound) and not sound:
+        return Response(xp.full_like(start, xp.nan), xp.asarray(False))
+    M, unique = _method(problem, world, form).minimise(start)
+    # Pseudo-inverses turn an overflow into finite nonsense: no number at all is the honest answer.
+    return Response(xp.where(sound, M, xp.nan), unique)
+
+
+_respond_in_one_program = program(_respond)
+
+
+def respond(problem: PerformativeProblem, deployed: Any, start: Any = None) -> Response:
+    """Φ(deployed) in the free parameters; pure, works under jit and vmap; carries no derivative."""
+    start = deployed if start is None else start
+    if known(problem, deployed, start) and _held(problem):
+        with np.errstate(all="ignore"):
+            return _respond(problem, on_host(deployed), on_host(start))
+    # Loops are not differentiated: nothing that varies goes in.
+    arrays, rest = eqx.partition((problem, deployed, start), eqx.is_array)
+    return _respond_in_one_program(*eqx.combine(jax.lax.stop_gradient(arrays), rest))
+
+
+def response_jacobian(problem: PerformativeProblem, deployed: Any, response: Any) -> Any:
+    """Φ'(deployed), (p, p), given Φ(deployed), by the implicit function theorem; where the Hessian is held."""
+    world = world_of(problem, deployed)
+    method = _method(problem, world, _shape_of_cost(problem, world))
+    assert not isinstance(method, AffineByProducts)
+    return method.jacobian(response, reaction_jacobian(problem, response, deployed))
+
+
+def response_pushforward(problem: PerformativeProblem, deployed: Array, response: Array) -> Operator:
+    """V -> Φ'(deployed)[V], given Φ(deployed), by products alone; for use inside programs."""
+    world = world_of(problem, deployed)
+    newton = _method(problem, world, _shape_of_cost(problem, world)).newton(response)
+    base, pushforward = jax.linearize(lambda policy: exact_gradient(problem, response, policy), deployed)
+    # A Newton step is affine in the gradient to first order at a solution; its value there is zero up to rounding.
+    _, step_forward = jax.linearize(newton, base)
+    return lambda V: step_forward(pushforward(V))
+
+
+@eqx.filter_jit
+def differentiable_response(problem: PerformativeProblem, deployed: Array) -> Array:
+    """Φ(deployed) with its derivative: one Newton step on frozen matrices carries it and changes no value."""
+    world = world_of(problem, deployed)
+    M = respond(problem, deployed).M
+    frozen = jax.lax.stop_gradient(world)
+    newton = _method(problem, frozen, _shape_of_cost(problem, frozen)).newton(M)
+    corrected = newton(weigh(problem, world, M)[1])
+    return M + (corrected - jax.lax.stop_gradient(corrected))
+
+
+def natural_residual(problem: PerformativeProblem, M: Any, deployed: Any) -> Any:
+    """‖M - Proj(M - η g)‖_F relative to ‖M‖_F + η ‖g(0)‖_F, η = 1/‖Hessian‖; g by a pass over time of its own."""
+    world = world_of(problem, deployed)
+    form = _shape_of_cost(problem, world)
+    xp, _ = numerics(form, M)
+    at_zero, at_M = weigh(problem, world, 0 * M)[1], weigh(problem, world, M)[1]
+    sound = _sound((form, at_M))
+    if known(sound) and not sound:
+        return xp.asarray(xp.inf, at_M.dtype)
+    step = form.step if isinstance(form, Quadratic) else _separable_method(problem, world, form).step
+    moved = frobenius(M - nearest(problem.feasible_set, M - step * at_M))
+    scale = frobenius(M) + step * frobenius(at_zero)
+    return xp.where(sound, moved / xp.where(scale > 0, scale, 1), xp.inf)
+
+
+_residual_in_one_program = program(natural_residual)
+
+
+def residual_of(problem: PerformativeProblem, M: Any, deployed: Any) -> Any:
+    """`natural_residual`; from the host where that can be, else as one program."""
+    if known(problem, M, deployed) and _held(problem):
+        with np.errstate(all="ignore"):
+            return natural_residual(problem, on_host(M), on_host(deployed))
+    return _residual_in_one_program(problem, M, deployed)
+
+
+def best_response(problem: PerformativeProblem, deployed: Any) -> Array:
+    """Φ(deployed) = argmin over the feasible set of C_T(·; deployed): what retraining on observed data would give.
+
+    Exact for quadratic costs. Without constraint or mean noise it does not depend on the noise covariance, nor on
+    x_0. The least-norm minimiser where there are several and the set is affine.
+
+    Args:
+        deployed: free policy parameters that the world reacts to.
+
+    Returns:
+        Shape `problem.policy_shape`.
+
+    Raises:
+        InputError: wrong shapes, or a cost or perturbation without closed moments.
+    """
+    deployed = problem.check_policy("deployed", deployed)
+    require_moments(problem)
+    if not known(problem, deployed):
+        return differentiable_response(problem, deployed)
+    return jnp.asarray(check_finite("the best response", respond(problem, deployed).M))
+
+
+def residual(problem: PerformativeProblem, M: Any, *, deployed: Any = None) -> Array:
+    """Relative natural residual ‖M - Proj(M - ηg)‖_F / (‖M‖_F + η‖g(0)‖_F), g = ∇_1 C_T(M; deployed), η = 1/‖Hessian‖.
+
+    Zero exactly at a best response to `deployed`; with `deployed=None` (M itself) at a performatively stable policy.
+    """
+    M, reacting = check_pair(problem, M, deployed)
+    require_moments(problem)
+    return jnp.asarray(check_finite("the residual", residual_of(problem, M, reacting)))

@@ -1,0 +1,83 @@
+"""Best response without constraint, structure or change in the noise: the Hessian is 2 (G ⊗ Σ + G̃ ⊗ w̄w̄ᵀ).
+
+With a = Σ^{-1/2} w̄ and Y = M̂ Σ^{1/2}: the part of Y across a meets G alone, the part along a G + |a|² G̃: two solves
+with H m unknowns. Where G or Σ is singular, the dense method serves.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+from perfcontrol._programs import cond, numerics
+from perfcontrol.response.quadratic import Operator
+
+
+class Separable:
+    """The quadratic given by its factors.
+
+    Args:
+        curvatures: G and G̃, (H m, H m). Sigma, w: covariance and mean of the noise. gradient: M -> ∇_1 C_T(M; M').
+        shape: of the policy. dense: the method that serves where G or Σ is singular.
+    """
+
+    def __init__(
+        self,
+        curvatures: tuple[Any, Any],
+        Sigma: Any,
+        w: Any,
+        gradient: Operator,
+        shape: tuple[int, int, int],
+        dense: Callable[[], Any],
+    ):
+        self.gradient, self.shape, self.dense = gradient, shape, dense
+        xp, self.linalg = numerics(curvatures, Sigma, w)
+        G, G_mean = curvatures
+        H, m, n = shape
+        eps, tiny = xp.finfo(G.dtype).eps, xp.finfo(G.dtype).tiny
+        G_values, self.G_vectors = xp.linalg.eigh(G)
+        S_values, S_vectors = xp.linalg.eigh(Sigma)
+        self.regular = (G_values[0] > H * m * eps * G_values[-1]) & (S_values[0] > n * eps * S_values[-1])
+        self.G_values = xp.where(G_values > 0, G_values, 1)
+        largest = 2 * (G_values[-1] * S_values[-1] + xp.trace(G_mean) * (w @ w))
+        self.step = 1 / xp.maximum(largest, tiny)
+        self.inverse_root = (S_vectors / xp.sqrt(xp.where(S_values > 0, S_values, 1))) @ S_vectors.T
+        a = self.inverse_root @ w
+        squared = a @ a
+        self.unit = a / xp.sqrt(xp.where(squared > 0, squared, 1))
+        shift = xp.where(self.regular, 0, 1) * xp.eye(H * m, dtype=G.dtype)
+        self.along = G + squared * G_mean + shift
+
+    def _separately(self, gradients: Any) -> Any:
+        """Newton steps for gradients (k, H, m, n)."""
+        H, m, n = self.shape
+        right = -gradients.reshape(-1, H * m, n) @ self.inverse_root / 2
+        mean_part = right @ self.unit  # (k, Hm)
+        across = right - mean_part[..., None] * self.unit
+        Y = self.G_vectors @ ((self.G_vectors.T @ across) / self.G_values[:, None])
+        factor = self.linalg.cho_factor(self.along, lower=True)
+        along = self.linalg.cho_solve(factor, mean_part.T).T
+        Y = Y + (along - Y @ self.unit)[..., None] * self.unit
+        return (Y @ self.inverse_root).reshape(gradients.shape)
+
+    def solve(self, gradient: Any) -> Any:
+        """The Newton step for a gradient, or for each of several along the first axis."""
+        several = gradient.reshape(-1, *self.shape)
+        steps = cond(self.regular, lambda: self._separately(several), lambda: self.dense().solve(several))
+        return steps.reshape(gradient.shape)
+
+    def minimise(self, start: Any) -> tuple[Any, Any]:
+        """The minimiser (of least norm), and whether it is the only one."""
+
+        def regular() -> tuple[Any, Any]:
+            M = self._separately(self.gradient(0 * start)[None])[0]
+            M = M + self._separately(self.gradient(M)[None])[0]  # one step of iterative refinement
+            return M, self.regular
+
+        return cond(self.regular, regular, lambda: self.dense().minimise(start))
+
+    def newton(self, M: Any) -> Operator:
+        """gradient -> the Newton step from near the minimiser M."""
+        return self.solve
+
+    def jacobian(self, M: Any, reaction: Any) -> Any:
+        """Φ', (p, p), given 𝐄 = ∂_2 g, (p, p)."""
+        return self.solve(reaction.T).T
