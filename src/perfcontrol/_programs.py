@@ -79,9 +79,18 @@ class Program:
         fixed = structure, tuple(None if _is_array(leaf) else leaf for leaf in leaves)
         if not known(inputs):
             return self._inlined(fixed, inputs)
-        with jax.ensure_compile_time_eval():  # known numbers stay known inside somebody else's trace
+        answer = self._stand(fixed, inputs)
+        return answer if self.on_device else jax.tree.map(np.asarray, answer)
+
+    def _stand(self, fixed: Any, inputs: list) -> Any:
+        try:
             answer = self._standing(fixed, inputs)
-            return answer if self.on_device else jax.tree.map(np.asarray, answer)
+            if known(answer):
+                return answer
+        except ValueError:  # JAX refuses compiler options inside somebody else's trace
+            pass
+        with jax.ensure_compile_time_eval():  # there, known numbers stay known
+            return self._standing(fixed, inputs)
 
 
 def program(function: Callable | None = None, *, on_device: bool = False) -> Any:
