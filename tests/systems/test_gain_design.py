@@ -65,3 +65,31 @@ DESIGNS_REFUSED = {
 @pytest.mark.parametrize("case", DESIGNS_REFUSED.values(), ids=DESIGNS_REFUSED.keys())
 def test_gain_design_is_refused_with_a_four_part_error(case):
     assert_refused(*case)
+
+
+A_PUBLISHED = np.array([[0.7, 0.3, 0.2], [-0.2, 0.4, 0.5], [-0.4, 0.2, -0.3]])
+B_PUBLISHED = np.array([[0.5, -0.3], [0.8, 0.3], [0.1, 0.9]])
+DIRECTION = 0.1 * np.array([[2.0, 9.0, -6.0], [9.0, 9.0, 4.0], [-9.0, -2.0, 5.0]])
+GAIN = -np.array([[-0.2130622, -0.34520195, -0.33427461], [0.39663286, -0.0863928, 0.14257925]])
+
+
+def test_generalised_riccati_gain_matches_the_published_one():
+    system = pc.LinearSystem(A_PUBLISHED, B_PUBLISHED)
+    gain = pc.design_gain(system, Q=np.eye(3), R=np.eye(2), directions=[DIRECTION], variances=[0.1])
+    np.testing.assert_allclose(gain, GAIN, atol=1e-8)
+    plain = pc.design_gain(system, Q=np.eye(3), R=np.eye(2))
+    none = pc.design_gain(system, Q=np.eye(3), R=np.eye(2), directions=[DIRECTION], variances=[0.0])
+    np.testing.assert_allclose(none, plain, atol=1e-9)
+    horizon = pc.LinearSystem(np.broadcast_to(A_PUBLISHED, (200, 3, 3)), B_PUBLISHED)
+    first = pc.design_gain(horizon, Q=np.eye(3), R=np.eye(2), directions=[DIRECTION], variances=0.1)[0]
+    np.testing.assert_allclose(first, GAIN, atol=1e-8)
+
+
+def test_gain_design_says_when_multiplicative_noise_is_too_strong():
+    system = pc.LinearSystem(A_PUBLISHED, B_PUBLISHED)
+    with pytest.raises(pc.InputError, match="mean square"):
+        pc.design_gain(system, Q=np.eye(3), R=np.eye(2), directions=[10 * DIRECTION], variances=[1.0])
+    with pytest.raises(pc.InputError, match="directions"):
+        pc.design_gain(system, Q=np.eye(3), R=np.eye(2), variances=[1.0])
+    with pytest.raises(pc.InputError, match="non-negative"):
+        pc.design_gain(system, Q=np.eye(3), R=np.eye(2), directions=[DIRECTION], variances=[-1.0])

@@ -65,3 +65,23 @@ def prediction_problem(sensitivity: float, mean: float = 10.0, deviation: float 
             [one], np.array([[0.0], [deviation]]), mean=pc.Affine(np.array([[[0.0]], [[mean - 1]]]), slope)
         ),
     )
+
+
+def order_problem(epsilon):
+    """Scalar, K = 0: Δ_t = (0.1 + ε_t M) ζ_t."""
+    one = np.ones((1, 1))
+    T = len(epsilon)
+    return pc.PerformativeProblem(
+        system=pc.LinearSystem(0.8 * one, one),
+        horizon=T,
+        noise=pc.Rademacher(1.0),
+        cost=pc.QuadraticCost(one, one),
+        perturbation=pc.DirectionalPerturbation(
+            [one], pc.Affine(np.full((T, 1), 0.1), np.asarray(epsilon).reshape(T, 1, 1, 1, 1))
+        ),
+        feasible_set=pc.FrobeniusBall(2.0),
+    )
+
+
+def small_reaction():
+    return random_problem(0, "scalar", strength=1e-5)

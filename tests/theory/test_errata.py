@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 
 import perfcontrol as pc
-from perfcontrol.theory.constants import growth, printed_constants, repaired_constants, rigorous_constants
-from perfcontrol.theory.ingredients import gather
-from perfcontrol.theory.local import hessian
-from perfcontrol.theory.propositions import envelope_shape
-from perfcontrol.theory.strong_stability import candidates
+from perfcontrol.theory.certificates.constants import growth, printed_constants, repaired_constants, rigorous_constants
+from perfcontrol.theory.certificates.ingredients import gather
+from perfcontrol.theory.derivatives import hessian
+from perfcontrol.theory.rates.propositions import envelope_shape
+from perfcontrol.theory.stability.strong_stability import candidates
 
 
 def scalar_problem(A=0.9, b=1.0, K=0.0, weight=0.5, horizon=200, x0=0.0, noise=None, radius=1.0):

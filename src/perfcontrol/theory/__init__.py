@@ -3,30 +3,27 @@
 Host-level: NumPy and SciPy around the exact engine; nothing here promises to work under jit or vmap.
 """
 
-from perfcontrol.theory.certificate import KINDS, Assumption, Certificate
-from perfcontrol.theory.certify import certify
+from perfcontrol.theory.assumptions import Assumption
+from perfcontrol.theory.certificates.certificate import KINDS, Certificate
+from perfcontrol.theory.certificates.certify import certify
+from perfcontrol.theory.certificates.report import certificate_row, verdict_rows
+from perfcontrol.theory.derivatives import hessian, reaction_jacobian
 from perfcontrol.theory.existence import existence
-from perfcontrol.theory.local import hessian, reaction_jacobian
-from perfcontrol.theory.mean_square import MeanSquareStability
-from perfcontrol.theory.orders import OrderVerdict, compare_orders, order_by_bound
-from perfcontrol.theory.propositions import (
+from perfcontrol.theory.rates.error_bounds import rrm_error_bound, rsgd_error_bound
+from perfcontrol.theory.rates.orders import OrderVerdict, compare_orders, order_by_bound
+from perfcontrol.theory.rates.propositions import (
     SensitivityEnvelope,
     SumThreshold,
     envelope_shape,
     sensitivity_envelope,
     sum_threshold,
 )
-from perfcontrol.theory.rates import (
-    TheoremStepSize,
-    descent_constants,
-    rrm_error_bound,
-    rsgd_error_bound,
-    theorem_step_size,
-)
-from perfcontrol.theory.report import certificate_row, verdict_rows
+from perfcontrol.theory.rates.step_size import TheoremStepSize, descent_constants, theorem_step_size
 from perfcontrol.theory.sensitivity import SensitivityEstimate, estimate_sensitivity
-from perfcontrol.theory.sharp import contraction_estimate, mean_square_stability, safe_step
-from perfcontrol.theory.strong_stability import StrongStability, strong_stability
+from perfcontrol.theory.stability.contraction import contraction_estimate
+from perfcontrol.theory.stability.mean_square import MeanSquareStability
+from perfcontrol.theory.stability.safe_step import mean_square_stability, safe_step
+from perfcontrol.theory.stability.strong_stability import StrongStability, strong_stability
 
 __all__ = [
     "KINDS",

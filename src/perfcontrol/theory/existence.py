@@ -15,7 +15,7 @@ from perfcontrol.costs import QuadraticCost
 from perfcontrol.perturbations import DirectionalPerturbation, NoPerturbation
 from perfcontrol.policy_maps import AbstractPolicyMap, Affine
 from perfcontrol.problem import PerformativeProblem
-from perfcontrol.theory.local import hessian_without_reaction, tangent_basis
+from perfcontrol.theory.derivatives import hessian_without_reaction, tangent_basis
 
 
 def set_radius(problem: PerformativeProblem) -> float | None:

@@ -12,8 +12,8 @@ from jaxtyping import Array
 
 from perfcontrol._checks import check_integer, check_key, fail
 from perfcontrol.problem import PerformativeProblem
-from perfcontrol.theory.certificate import Status
-from perfcontrol.theory.local import check_problem
+from perfcontrol.theory.assumptions import Status
+from perfcontrol.theory.derivatives import check_problem
 
 METHODS = ("analytic", "coupling", "transport")
 

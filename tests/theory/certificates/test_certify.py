@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import perfcontrol as pc
-from perfcontrol.theory.ingredients import gather
-from perfcontrol.theory.local import hessian
-from perfcontrol.theory.sampled_jacobian import sample_gradients
+from perfcontrol.theory.certificates.ingredients import gather
+from perfcontrol.theory.derivatives import hessian
+from perfcontrol.theory.stability.sampled_jacobian import sample_gradients
 from tests.theory.problems import random_problem
 
 SLACK = 1 + 1e-7

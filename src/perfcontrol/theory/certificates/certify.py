@@ -5,12 +5,12 @@ from typing import Any
 
 from perfcontrol._checks import fail
 from perfcontrol.problem import PerformativeProblem
-from perfcontrol.theory.certificate import KINDS, Certificate
-from perfcontrol.theory.global_bound import certify_global
-from perfcontrol.theory.local import check_problem
-from perfcontrol.theory.paper import certify_paper
-from perfcontrol.theory.rigorous import certify_rigorous
-from perfcontrol.theory.sharp import certify_sharp
+from perfcontrol.theory.certificates.certificate import KINDS, Certificate
+from perfcontrol.theory.certificates.global_bound import certify_global
+from perfcontrol.theory.certificates.paper import certify_paper
+from perfcontrol.theory.certificates.rigorous import certify_rigorous
+from perfcontrol.theory.certificates.sharp import certify_sharp
+from perfcontrol.theory.derivatives import check_problem
 
 CERTIFIERS: dict[str, Callable[..., Certificate]] = {
     "paper": certify_paper,

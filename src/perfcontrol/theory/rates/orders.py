@@ -12,8 +12,8 @@ import numpy as np
 
 from perfcontrol._checks import fail
 from perfcontrol.problem import PerformativeProblem
-from perfcontrol.theory.certify import certify
-from perfcontrol.theory.strong_stability import check_per_step
+from perfcontrol.theory.certificates.certify import certify
+from perfcontrol.theory.stability.strong_stability import check_per_step
 
 
 class OrderVerdict(NamedTuple):

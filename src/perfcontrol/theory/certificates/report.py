@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 
 from perfcontrol.problem import PerformativeProblem
-from perfcontrol.theory.certificate import KINDS, Certificate
-from perfcontrol.theory.certify import certify
+from perfcontrol.theory.certificates.certificate import KINDS, Certificate
+from perfcontrol.theory.certificates.certify import certify
 
 PLAIN_VALUES = (
     "kappa",

@@ -1,11 +1,12 @@
 """What a certificate says: whether it applies, whether it holds, by how much, and how each fact in it is known."""
 
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
-Status = Literal["proved", "declared", "estimated"]
+from perfcontrol.theory.assumptions import Assumption
+
 KINDS = ("paper", "rigorous", "global", "sharp")
 TITLES = {
     "paper": "The paper's sufficient condition, constants as printed",
@@ -13,21 +14,6 @@ TITLES = {
     "global": "The global contraction bound",
     "sharp": "The local test at the stable policy",
 }
-
-
-@dataclass(frozen=True)
-class Assumption:
-    """One thing that a verdict rests on, and how it is known.
-
-    status: "proved" (follows from the problem as given), "declared" (taken from the user's word), or "estimated"
-    (sampled or computed in floating point at a point, without a proof).
-    """
-
-    text: str
-    status: Status
-
-    def __str__(self) -> str:
-        return f"{self.text} ({self.status})"
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Rates and step sizes: what contraction and strong monotonicity promise of RRM and RSGD.
+"""Error bounds: what contraction and strong monotonicity promise of RRM and RSGD.
 
 With m = μ̃ - S > 0 (S the aggregated sensitivity), L = Σ λ_t + S, V ≥ Var ∇J_T and b paths a step, comparing with
 M^PS = Proj(M^PS - η g^PS) (no interior point is needed) gives
@@ -9,7 +9,7 @@ and for η_0 ≤ min(m/L², 1/m), η_n/η_{n+1} ≤ 1 + m η_{n+1}/2:  E_N ≤ �
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,78 +18,9 @@ from perfcontrol._checks import check_integer, fail
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.solvers import InverseStep
 from perfcontrol.solvers.step_sizes import as_step_size
-from perfcontrol.theory.certificate import Certificate
-from perfcontrol.theory.certify import certify
-from perfcontrol.theory.local import check_problem
-
-
-class TheoremStepSize(NamedTuple):
-    """η_n = phi1 / (n + phi2); pass it on as `pc.InverseStep(*step)`."""
-
-    phi1: float
-    phi2: float
-
-
-class DescentConstants(NamedTuple):
-    """m = μ̃ - S, L = Σλ + S, V, and the certificate that they come from."""
-
-    monotonicity: float
-    lipschitz: float
-    variance: float
-    certificate: Certificate
-
-
-def descent_constants(problem: PerformativeProblem, kind: str = "rigorous", **declared: Any) -> DescentConstants:
-    """m, L and V of a problem.
-
-    Raises:
-        InputError: the certificate is not applicable, or S ≥ μ̃, so that no step size is proved to work.
-    """
-    check_problem(problem)
-    if kind not in ("rigorous", "paper"):
-        raise fail("kind", repr(kind), "be 'rigorous' or 'paper'", "Only these two come with gradient bounds.")
-    certificate = certify(problem, kind, **declared)
-    if not certificate.applicable:
-        raise fail(
-            "problem",
-            f"a certificate that is not applicable: {'; '.join(certificate.missing)}",
-            f"admit the {kind} certificate",
-            "Declare what is missing, or use pc.safe_step.",
-        )
-    assert certificate.lhs is not None and certificate.rhs is not None
-    if not certificate.holds:
-        raise fail(
-            "problem",
-            f"S = {certificate.lhs:.4g} ≥ μ̃ = {certificate.rhs:.4g}",
-            "have an aggregated sensitivity S below the strong convexity μ̃",
-            "No step size is proved to work then; pc.safe_step finds one by local analysis.",
-        )
-    constants = certificate.values["constants"]
-    return DescentConstants(
-        certificate.rhs - certificate.lhs, constants.total_smoothness + certificate.lhs, constants.variance, certificate
-    )
-
-
-def theorem_step_size(problem: PerformativeProblem, *, kind: str = "rigorous", **declared: Any) -> TheoremStepSize:
-    """φ₁ and φ₂ of the diminishing step η_n = φ₁/(n + φ₂) with the largest first step that the theorem allows.
-
-    φ₁/φ₂ = c with c = min(m/L², 1/m) (as printed: m/(2L²) in place of m/L²), and φ₂ ≥ 1 the smallest for which
-    φ₁/(1 + 1/φ₂) ≥ 2/m.
-
-    Args:
-        kind: "rigorous", or "paper" for the printed constants. declared: values for the certificate.
-
-    Raises:
-        InputError: no such step exists, with the reason.
-
-    References:
-        Theorem 1, conditions (17) and (18).
-    """
-    m, L, _, _ = descent_constants(problem, kind, **declared)
-    first = min(m / L**2 / (2 if kind == "paper" else 1), 1 / m)
-    ratio = 2 / (m * first)
-    phi2 = max(1.0, (ratio + math.sqrt(ratio**2 + 4 * ratio)) / 2)
-    return TheoremStepSize(first * phi2, phi2)
+from perfcontrol.theory.certificates.certify import certify
+from perfcontrol.theory.derivatives import check_problem
+from perfcontrol.theory.rates.step_size import descent_constants
 
 
 def rrm_error_bound(

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from perfcontrol.theory.ingredients import Ingredients
-from perfcontrol.theory.strong_stability import StrongStability
+from perfcontrol.theory.certificates.ingredients import Ingredients
+from perfcontrol.theory.stability.strong_stability import StrongStability
 
 
 @dataclass(frozen=True)

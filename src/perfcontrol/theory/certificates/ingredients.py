@@ -11,9 +11,9 @@ from perfcontrol._checks import as_array, fail
 from perfcontrol._linalg import along_time
 from perfcontrol.costs import QuadraticCost
 from perfcontrol.problem import PerformativeProblem
-from perfcontrol.theory.certificate import Assumption, Status
-from perfcontrol.theory.local import fixed_noise
-from perfcontrol.theory.strong_stability import check_per_step
+from perfcontrol.theory.assumptions import Assumption, Status
+from perfcontrol.theory.derivatives import fixed_noise
+from perfcontrol.theory.stability.strong_stability import check_per_step
 
 DECLARABLE = (
     "strong_convexity",

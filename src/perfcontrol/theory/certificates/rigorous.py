@@ -5,12 +5,13 @@ from typing import Any
 import numpy as np
 
 from perfcontrol.problem import PerformativeProblem
-from perfcontrol.theory.certificate import Assumption, Certificate, not_applicable
-from perfcontrol.theory.constants import Constants, rigorous_constants
-from perfcontrol.theory.convexity import rigorous_convexity
+from perfcontrol.theory.assumptions import Assumption
+from perfcontrol.theory.certificates.certificate import Certificate, not_applicable
+from perfcontrol.theory.certificates.constants import Constants, rigorous_constants
+from perfcontrol.theory.certificates.convexity import rigorous_convexity
+from perfcontrol.theory.certificates.ingredients import Ingredients, gather
 from perfcontrol.theory.existence import existence
-from perfcontrol.theory.ingredients import Ingredients, gather
-from perfcontrol.theory.strong_stability import StrongStability, candidates
+from perfcontrol.theory.stability.strong_stability import StrongStability, candidates
 
 
 def obstacles(problem: PerformativeProblem, items: Ingredients) -> list[str]:

@@ -11,9 +11,9 @@ import numpy as np
 
 from perfcontrol._checks import check_integer, fail
 from perfcontrol.problem import PerformativeProblem
-from perfcontrol.theory.certificate import Certificate
-from perfcontrol.theory.certify import certify
-from perfcontrol.theory.ingredients import Ingredients
+from perfcontrol.theory.certificates.certificate import Certificate
+from perfcontrol.theory.certificates.certify import certify
+from perfcontrol.theory.certificates.ingredients import Ingredients
 
 
 class SumThreshold(NamedTuple):

@@ -23,7 +23,7 @@ from jaxtyping import Array
 
 from perfcontrol._checks import check_integer, fail
 from perfcontrol.problem import PerformativeProblem
-from perfcontrol.theory.sampled_jacobian import JacobianSamples, sample_gradients
+from perfcontrol.theory.stability.sampled_jacobian import JacobianSamples, sample_gradients
 
 DEFAULT_SEED = 20241
 Map = Callable[[np.ndarray], np.ndarray]

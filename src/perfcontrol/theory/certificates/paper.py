@@ -6,13 +6,14 @@ from typing import Any
 import numpy as np
 
 from perfcontrol.problem import PerformativeProblem
-from perfcontrol.theory.certificate import Assumption, Certificate, not_applicable
-from perfcontrol.theory.constants import Constants, printed_constants, repaired_constants
-from perfcontrol.theory.convexity import printed_convexity
+from perfcontrol.theory.assumptions import Assumption
+from perfcontrol.theory.certificates.certificate import Certificate, not_applicable
+from perfcontrol.theory.certificates.constants import Constants, printed_constants, repaired_constants
+from perfcontrol.theory.certificates.convexity import printed_convexity
+from perfcontrol.theory.certificates.ingredients import Ingredients, gather
+from perfcontrol.theory.derivatives import fixed_noise
 from perfcontrol.theory.existence import constant_mean, existence
-from perfcontrol.theory.ingredients import Ingredients, gather
-from perfcontrol.theory.local import fixed_noise
-from perfcontrol.theory.strong_stability import StrongStability, candidates
+from perfcontrol.theory.stability.strong_stability import StrongStability, candidates
 
 SHRINKING = (1.0, 0.9, 0.75, 0.5, 0.25, 0.1)  # a smaller γ is valid too, and 1/(1-γ) may like it
 

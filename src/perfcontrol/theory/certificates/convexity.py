@@ -15,9 +15,9 @@ import numpy as np
 from perfcontrol._linalg import along_time
 from perfcontrol.costs import QuadraticCost
 from perfcontrol.problem import PerformativeProblem
+from perfcontrol.theory.certificates.ingredients import Ingredients
+from perfcontrol.theory.derivatives import fixed_noise, hessian, tangent_basis, without_reaction
 from perfcontrol.theory.existence import constant_mean
-from perfcontrol.theory.ingredients import Ingredients
-from perfcontrol.theory.local import fixed_noise, hessian, tangent_basis, without_reaction
 
 
 def printed_convexity(items: Ingredients, kappa: float, gamma: float) -> float:

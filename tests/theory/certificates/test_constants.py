@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import perfcontrol as pc
-from perfcontrol.theory.constants import products, rigorous_constants
-from perfcontrol.theory.ingredients import gather
-from perfcontrol.theory.strong_stability import candidates
+from perfcontrol.theory.certificates.constants import products, rigorous_constants
+from perfcontrol.theory.certificates.ingredients import gather
+from perfcontrol.theory.stability.strong_stability import candidates
 from tests.oracles.enumeration import Paths, simulate
 from tests.theory.problems import SHAPES, random_problem
 

@@ -1,0 +1,142 @@
+"""The global certificate: a proved modulus of contraction of Φ over the whole set, for quadratic costs and fixed
+directions. No strong stability and no bounded noise is needed.
+
+With Δ_t = Θ_t + Σ_k σ_{tk}(M') ζ_{tk} D_k and θ = σ², the cost in coordinates y of the set is [1; y]ᵀ𝔾(θ)[1; y] where
+𝔾 is a polynomial in θ with positive semidefinite coefficients (every path of the expansion in ζ is a square). So on
+[θ_lo, θ_hi] it increases, and |𝔾(θ') - 𝔾(θ)| ⪯ N(M - M') 𝔏 in every direction, 𝔏 the derivative of 𝔾 at θ_hi along
+ℓ, where |θ_{tk}(M) - θ_{tk}(M')| ≤ ℓ_{tk} N(M - M') in the norm N(y)² = yᵀGy, G the y-block of 𝔾(θ_lo). With
+ϱ = λ_max(𝔏_yy, G) and h ≥ [1; y]ᵀ𝔏[1; y] at every best response,
+
+    N(Φ(M) - Φ(M')) ≤ √(ϱ h) N(M - M').
+
+References: docs, theory, "The global certificate".
+"""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import scipy.linalg
+import scipy.optimize
+
+from perfcontrol.costs import QuadraticCost
+from perfcontrol.perturbations import DirectionalPerturbation
+from perfcontrol.problem import PerformativeProblem
+from perfcontrol.theory.assumptions import Assumption
+from perfcontrol.theory.certificates.certificate import Certificate, not_applicable
+from perfcontrol.theory.certificates.quadratic_form import form_at, form_derivative, least_cost, simplified
+from perfcontrol.theory.certificates.scale_range import ScaleRange
+from perfcontrol.theory.certificates.scale_range import scale_range as _scale_range
+from perfcontrol.theory.derivatives import DENSE_LIMIT, tangent_basis
+from perfcontrol.theory.existence import constant_mean, existence
+
+
+def certify_global(problem: PerformativeProblem, *, scale_range: Any = None) -> Certificate:
+    """A modulus of contraction of Φ in the norm N, for quadratic costs and perturbations along fixed directions.
+
+    Args:
+        scale_range: (low, high, Lipschitz constant) of the scales over the set, each broadcast to (T, k), for scales
+        that are a general function or a set on which they are not known to be bounded.
+
+    References:
+        docs: theory, "The global certificate".
+    """
+    exists, reason = existence(problem)
+    missing = []
+    if not isinstance(problem.cost, QuadraticCost):
+        missing.append("the cost is not quadratic")
+    if not isinstance(problem.perturbation, DirectionalPerturbation):
+        missing.append("the perturbations are not of fixed directions (pc.DirectionalPerturbation)")
+    elif not constant_mean(problem):
+        missing.append("the mean of the perturbations depends on the policy")
+    if problem.noise_reacts:
+        missing.append("the noise reacts to the policy")
+    if int(np.prod(problem.policy_shape)) > DENSE_LIMIT:
+        missing.append(f"more than {DENSE_LIMIT} free parameters")
+    ranges = None
+    if not missing:
+        ranges = _scale_range(problem, scale_range)
+        if isinstance(ranges, str):
+            missing.append(ranges)
+    if missing or ranges is None or isinstance(ranges, str):
+        return not_applicable("global", missing, exists, reason)
+    assumptions = (
+        Assumption("the modulus of contraction", "proved"),
+        *([Assumption("the range of the scales", "declared")] if scale_range is not None else []),
+    )
+    modulus, values, note = _modulus(problem, ranges)
+    if exists is None and modulus < 1:
+        exists, reason = True, "Φ is a contraction of a closed set"
+    return Certificate(
+        "global",
+        True,
+        holds=modulus < 1,
+        exists=exists,
+        existence=reason,
+        lhs=modulus,
+        rhs=1.0,
+        rate=modulus,
+        assumptions=assumptions,
+        values=values,
+        notes=(note,) if note else (),
+    )
+
+
+def _modulus(problem: PerformativeProblem, ranges: ScaleRange) -> tuple[float, dict[str, Any], str]:
+    """√(ϱ h), the metric N as a matrix G with its basis, and a remark."""
+    problem = simplified(problem)
+    dtype = problem.dtype
+    basis = tangent_basis(problem)
+    if basis.shape[1] == 0:
+        return 0.0, {}, "The set is a single policy."
+    low = np.where((ranges.low <= 0) & (ranges.high >= 0), 0.0, np.minimum(ranges.low**2, ranges.high**2))
+    largest = np.maximum(np.abs(ranges.low), np.abs(ranges.high))
+    high = largest**2
+    Z = jnp.asarray(basis, dtype)
+    form = np.asarray(form_at(problem, Z, jnp.asarray(low, dtype)), dtype=float)
+    G = form[1:, 1:]
+    floor = float(np.linalg.eigvalsh(G)[0])
+    if floor <= 1e-12 * float(np.linalg.norm(G, 2)):
+        return np.inf, {}, "The cost is not strictly convex along the set without perturbations."
+    if ranges.slopes is None:
+        lipschitz = ranges.lipschitz / np.sqrt(floor)
+    else:
+        reduced = ranges.slopes.reshape(-1, ranges.slopes.shape[-1]) @ basis
+        whitened = scipy.linalg.solve_triangular(np.linalg.cholesky(G), reduced.T, lower=True)
+        lipschitz = np.linalg.norm(whitened, axis=0).reshape(largest.shape)
+    along = jnp.asarray(2 * largest * lipschitz, dtype)
+    L = np.asarray(form_derivative(problem, Z, jnp.asarray(high, dtype), along), dtype=float)
+    values: dict[str, Any] = {"metric": G, "basis": basis}
+    if float(np.abs(L[1:, :]).max()) == 0:
+        return 0.0, values, "The reaction does not move the best response."
+    level = float(least_cost(problem, jnp.asarray(high, dtype)))
+    stretch = float(scipy.linalg.eigh(L[1:, 1:], G, eigvals_only=True)[-1])
+    height = largest_on_sublevel((L + L.T) / 2, form, level)
+    return float(np.sqrt(max(stretch, 0.0) * max(height, 0.0))), values, ""
+
+
+def largest_on_sublevel(L: np.ndarray, G: np.ndarray, level: float) -> float:
+    """An upper bound of max [1;y]ᵀL[1;y] subject to [1;y]ᵀG[1;y] ≤ level, by the dual (any dual point is valid).
+
+    Args:
+        L, G: (1+q, 1+q), positive semidefinite, the y-block of G definite. level: at least the minimum of the form G.
+    """
+    factor = np.linalg.cholesky(G[1:, 1:])
+    centre = -scipy.linalg.cho_solve((factor, True), G[1:, 0])
+    slack = max(level - float(G[0, 0] + G[1:, 0] @ centre), 0.0)
+    shift = np.concatenate([[1.0], centre])
+    constant = float(shift @ L @ shift)
+    linear = scipy.linalg.solve_triangular(factor, (L @ shift)[1:], lower=True)
+    curved = scipy.linalg.solve_triangular(factor, L[1:, 1:], lower=True)
+    curved = scipy.linalg.solve_triangular(factor, curved.T, lower=True)
+    values, vectors = np.linalg.eigh((curved + curved.T) / 2)
+    weights = (vectors.T @ linear) ** 2
+    top = max(float(values[-1]), 0.0)
+
+    def dual(log_excess: float) -> float:
+        tau = top + np.exp(log_excess)
+        return constant + tau * slack + float(np.sum(weights / (tau - values)))
+
+    scale = np.log(max(top, np.sqrt(weights.sum() / max(slack, 1e-300)), 1e-300))
+    found = scipy.optimize.minimize_scalar(dual, bounds=(scale - 30, scale + 10), method="bounded")
+    return min(dual(float(found.x)), dual(scale), dual(scale - 30))  # type: ignore[attr-defined]

@@ -1,0 +1,1 @@
+"""What a certificate promises: step sizes, error bounds, which sensitivities and orders are admissible."""

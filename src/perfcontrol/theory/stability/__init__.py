@@ -1,0 +1,1 @@
+"""Stability of the closed loop, and of the methods near a stable policy."""
