@@ -59,7 +59,8 @@ class Program:
     def _jit(self, **options: Any) -> Callable:
         def run(fixed: tuple[Any, tuple], inputs: list) -> Any:
             structure, others = fixed
-            leaves = [other if array is None else array for array, other in zip(inputs, others, strict=True)]
+            pairs = zip(inputs, others, strict=True)
+            leaves = [other if array is None else jnp.asarray(array) for array, other in pairs]
             return self.function(*jax.tree.unflatten(structure, leaves))
 
         run.__name__ = self.function.__name__

@@ -138,7 +138,7 @@ def cost_to_go(problem: PerformativeProblem, reacting: Array) -> CostToGo:
     return CostToGo(Lambda, on_v, between, S, D, F, B, noise.mean, noise.covariance)
 
 
-@program
+@program(on_device=True)  # what works with it are programs, too
 def world_of(problem: PerformativeProblem, deployed: Any) -> CostToGo:
     """`cost_to_go` of the deployed policy's free parameters."""
     return cost_to_go(problem, problem.structure.lift(deployed))

@@ -2,15 +2,16 @@
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from perfcontrol._linalg import symmetrise
-from perfcontrol._programs import Numbers, program
+from perfcontrol._programs import Numbers, known, on_host, program
 from perfcontrol.evaluate.cost_to_go import CostToGo
 from perfcontrol.evaluate.exact import weigh
 from perfcontrol.evaluate.impulses import impulse_form
@@ -47,10 +48,37 @@ def stationary(world: CostToGo) -> bool:
     return world.noise_mean.ndim == 1 and world.noise_covariance.ndim == 2
 
 
-@program
-def curvature(problem: PerformativeProblem, world: CostToGo) -> tuple[Array, Array]:
-    """G and G̃, (H m, H m): for constant noise moments the Hessian is 2 (G ⊗ Σ + G̃ ⊗ w̄w̄ᵀ) in the lifted policy."""
-    return impulse_form(world, problem.memory).G, sustained_form(world, problem.memory)
+class Factors(NamedTuple):
+    """The same quadratic for constant noise moments: gradient(M̂) = linear + 2 (G M̂ Σ + G̃ M̂ w̄w̄ᵀ), lifted.
+
+    linear: policy shape. G, G_mean: G and G̃, (H m, H m). Sigma, w: covariance and mean of the noise.
+    """
+
+    linear: Any
+    G: Any
+    G_mean: Any
+    Sigma: Any
+    w: Any
+
+    def gradient(self, M: Any) -> Any:
+        """The gradient at M."""
+        stacked = M.reshape(-1, M.shape[-1])
+        by_mean = (self.G_mean @ (stacked @ self.w))[:, None] * self.w
+        return self.linear + 2 * (self.G @ stacked @ self.Sigma + by_mean).reshape(M.shape)
+
+
+_impulse_form, _sustained_form = program(impulse_form), program(sustained_form)
+
+
+def factors(problem: PerformativeProblem, world: CostToGo) -> Factors:
+    """The factors of a given world."""
+    form = _impulse_form(world, problem.memory)
+    Sigma, w = on_host((world.noise_covariance, world.noise_mean))
+    if known(w) and not np.any(w):  # nothing has a mean that the policy could act on
+        linear = 2 * (form.F @ Sigma).reshape(problem.lifted_shape)
+        return Factors(linear, form.G, 0 * form.G, Sigma, w)
+    linear = weigh(problem, world, np.zeros(problem.policy_shape, world.S.dtype))[1]
+    return Factors(linear, form.G, _sustained_form(world, problem.memory), Sigma, w)
 
 
 @program
@@ -78,7 +106,8 @@ def _hessian_matrix(problem: PerformativeProblem, world: CostToGo, linear: Array
     if stationary(world):
         H, m, _ = problem.lifted_shape
         w = world.noise_mean
-        blocks = jnp.stack(curvature(problem, world)).reshape(2, H, m, H, m)
+        curvature = impulse_form(world, H).G, sustained_form(world, H)
+        blocks = jnp.stack(curvature).reshape(2, H, m, H, m)
         right = jnp.stack([world.noise_covariance, jnp.outer(w, w)])
 
         def column(direction: Array) -> Array:

@@ -26,7 +26,7 @@ from perfcontrol.problem import PerformativeProblem
 from perfcontrol.response import quadratic as quadratics
 from perfcontrol.response.affine import Affine, AffineByProducts
 from perfcontrol.response.projected import Projected, nearest
-from perfcontrol.response.quadratic import Operator, Quadratic, curvature, quadratic, quadratic_by_passes, stationary
+from perfcontrol.response.quadratic import Factors, Operator, factors, quadratic, quadratic_by_passes, stationary
 from perfcontrol.response.separable import Separable
 from perfcontrol.sets import FullStructure, Unconstrained
 
@@ -54,30 +54,26 @@ def _separable(problem: PerformativeProblem, world: CostToGo) -> bool:
 def _shape_of_cost(problem: PerformativeProblem, world: CostToGo) -> Any:
     """What the methods need to know of the quadratic; finite unless the world overflows."""
     if _separable(problem, world):
-        return curvature(problem, world)
+        return factors(problem, world)
     return quadratic(problem, world) if _held(problem) else quadratic_by_passes(problem, world)
 
 
 def _method(problem: PerformativeProblem, world: CostToGo, form: Any) -> Method:
     """The cheapest method that is exact for this kind of problem; known from types and shapes alone."""
-    if not isinstance(form, Quadratic):
+    if isinstance(form, Factors):
         return _separable_method(problem, world, form)
     if problem.feasible_set.affine:
         return (Affine if _held(problem) else AffineByProducts)(problem.feasible_set, form)
     return Projected(problem.feasible_set, form)
 
 
-def _separable_method(problem: PerformativeProblem, world: CostToGo, curvatures: Any) -> Separable:
+def _separable_method(problem: PerformativeProblem, world: CostToGo, form: Factors) -> Separable:
     def dense() -> Affine | AffineByProducts:
         if _held(problem):
             return Affine(problem.feasible_set, quadratic(problem, world))
         return AffineByProducts(problem.feasible_set, quadratic_by_passes(problem, world))
 
-    def gradient(M: Any) -> Any:
-        return weigh(problem, world, M)[1]
-
-    noise = world.noise_covariance, world.noise_mean
-    return Separable(curvatures, *noise, gradient, problem.lifted_shape, dense)
+    return Separable(form, dense)
 
 
 def _sound(form: Any) -> Any:
@@ -146,13 +142,13 @@ def natural_residual(problem: PerformativeProblem, M: Any, deployed: Any) -> Any
     world = world_of(problem, deployed)
     form = _shape_of_cost(problem, world)
     xp, _ = numerics(form, M)
-    at_zero, at_M = weigh(problem, world, 0 * M)[1], weigh(problem, world, M)[1]
+    at_M = weigh(problem, world, M)[1]
     sound = _sound((form, at_M))
     if known(sound) and not sound:
         return xp.asarray(xp.inf, at_M.dtype)
-    step = form.step if isinstance(form, Quadratic) else _separable_method(problem, world, form).step
+    step = _separable_method(problem, world, form).step if isinstance(form, Factors) else form.step
     moved = frobenius(M - nearest(problem.feasible_set, M - step * at_M))
-    scale = frobenius(M) + step * frobenius(at_zero)
+    scale = frobenius(M) + step * frobenius(form.linear)
     return xp.where(sound, moved / xp.where(scale > 0, scale, 1), xp.inf)
 
 

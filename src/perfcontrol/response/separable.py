@@ -8,30 +8,21 @@ from collections.abc import Callable
 from typing import Any
 
 from perfcontrol._programs import cond, numerics
-from perfcontrol.response.quadratic import Operator
+from perfcontrol.response.quadratic import Factors, Operator
 
 
 class Separable:
     """The quadratic given by its factors.
 
     Args:
-        curvatures: G and G̃, (H m, H m). Sigma, w: covariance and mean of the noise. gradient: M -> ∇_1 C_T(M; M').
-        shape: of the policy. dense: the method that serves where G or Σ is singular.
+        factors: of the quadratic. dense: the method that serves where G or Σ is singular.
     """
 
-    def __init__(
-        self,
-        curvatures: tuple[Any, Any],
-        Sigma: Any,
-        w: Any,
-        gradient: Operator,
-        shape: tuple[int, int, int],
-        dense: Callable[[], Any],
-    ):
-        self.gradient, self.shape, self.dense = gradient, shape, dense
-        xp, self.linalg = numerics(curvatures, Sigma, w)
-        G, G_mean = curvatures
-        H, m, n = shape
+    def __init__(self, factors: Factors, dense: Callable[[], Any]):
+        self.factors, self.dense = factors, dense
+        xp, self.linalg = numerics(factors)
+        _, G, G_mean, Sigma, w = factors
+        self.shape = H, m, n = factors.linear.shape
         eps, tiny = xp.finfo(G.dtype).eps, xp.finfo(G.dtype).tiny
         G_values, self.G_vectors = xp.linalg.eigh(G)
         S_values, S_vectors = xp.linalg.eigh(Sigma)
@@ -68,8 +59,8 @@ class Separable:
         """The minimiser (of least norm), and whether it is the only one."""
 
         def regular() -> tuple[Any, Any]:
-            M = self._separately(self.gradient(0 * start)[None])[0]
-            M = M + self._separately(self.gradient(M)[None])[0]  # one step of iterative refinement
+            M = self._separately(self.factors.linear[None])[0]
+            M = M + self._separately(self.factors.gradient(M)[None])[0]  # one step of iterative refinement
             return M, self.regular
 
         return cond(self.regular, regular, lambda: self.dense().minimise(start))

@@ -73,7 +73,7 @@ class Continuation(AbstractExactSolver):
     def step(self, problem: PerformativeProblem, state: State, key: Any) -> State:
         own, first = state.own, state.steps == 0
         xp, _ = numerics(problem, state)
-        tolerance = check_tolerance(self.tolerance, problem.dtype)
+        tolerance = check_tolerance(self.tolerance, state.M.dtype)
         eps = xp.finfo(state.M.dtype).eps
         here = xp.append(state.M.reshape(-1), own.level)
         end = xp.eye(here.size, dtype=here.dtype)[-1]
@@ -127,7 +127,7 @@ class Continuation(AbstractExactSolver):
         own = state.own
         residual = residual_of(problem, state.M, state.M)
         unfinished = Result.running if stopped else Result.not_converged
-        arrived = (own.level >= 1) & (residual <= check_tolerance(self.tolerance, problem.dtype))
+        arrived = (own.level >= 1) & (residual <= check_tolerance(self.tolerance, state.M.dtype))
         stats = {"residual": residual, "unique": own.unique, "level": own.level}
         return choose(arrived, Result.success, unfinished), stats
 

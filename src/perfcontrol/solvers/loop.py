@@ -284,7 +284,7 @@ def _from_host(
             history.append(_first(record, state.M))
         if progress is not None:
             progress(done, total)
-        if state.result != Result.running:
+        if state.result is not Result.running:  # known results are the members themselves
             break
     return state, [*history, _repeated(history[-1], total // every + 1 - len(history))]
 

@@ -44,7 +44,7 @@ class RRM(AbstractExactSolver):
         return start(M0, _Own(far, zero, xp.asarray(True), 1e8 * (1 + frobenius(M0))))
 
     def step(self, problem: PerformativeProblem, state: State, key: Any) -> State:
-        own, tolerance = state.own, check_tolerance(self.tolerance, problem.dtype)
+        own, tolerance = state.own, check_tolerance(self.tolerance, state.M.dtype)
         response = respond(problem, state.M)
         following = response.M
         xp, _ = numerics(following)

@@ -86,7 +86,7 @@ class StablePoint(AbstractExactSolver):
         finite = xp.isfinite(gap) & xp.all(xp.isfinite(M))
         ratio = gap / xp.where(own.gap > 0, own.gap, 1)  # zero at the first step: a step of minimisation follows
         limit = xp.where(state.steps == 0, FAR * (1 + frobenius(M) + frobenius(response.M)), own.limit)
-        tolerance = check_tolerance(self.tolerance, problem.dtype)
+        tolerance = check_tolerance(self.tolerance, state.M.dtype)
         scale = frobenius(M)
         done = gap <= 0.1 * tolerance * xp.where(scale > 0, scale, 1)
         # A Newton step that no longer helps has reached rounding, or is stuck: `finish` tells which by the residual.
@@ -106,7 +106,7 @@ class StablePoint(AbstractExactSolver):
         residual = residual_of(problem, state.M, state.M)
         unfinished = Result.running if stopped else Result.not_converged
         failed = choose(state.result == Result.nonfinite, Result.nonfinite, unfinished)
-        result = choose(residual <= check_tolerance(self.tolerance, problem.dtype), Result.success, failed)
+        result = choose(residual <= check_tolerance(self.tolerance, state.M.dtype), Result.success, failed)
         return result, {"residual": residual, "unique": state.own.unique, "rate": state.own.ratio}
 
 
