@@ -6,10 +6,35 @@ import numpy as np
 import pytest
 
 import perfcontrol as pc
-from perfcontrol.policy_maps import as_policy_map, evaluate_map
+from perfcontrol.policy_maps import ConstantMap, as_policy_map, evaluate_map
+from tests.contracts.policy_map import PolicyMapContract
 from tests.tools import assert_close, assert_refused, normal
 
 M = normal(1, 2, 3, 4)
+
+
+class TestConstantMap(PolicyMapContract):
+    def policy_map(self):
+        return ConstantMap(normal(11, 2, 3))
+
+
+class TestAffine(PolicyMapContract):
+    def policy_map(self):
+        return pc.Affine(normal(12, 2, 3), normal(13, 2, 3, 2, 2, 4))
+
+
+class TestFunction(PolicyMapContract):
+    knows = ()
+
+    def policy_map(self):
+        return pc.Function(lambda M, p: p * jnp.sum(jnp.tanh(M)) * jnp.ones((2, 3)), 0.3)
+
+
+class TestFunctionDeclaredConvex(PolicyMapContract):
+    knows = ()
+
+    def policy_map(self):
+        return pc.Function(lambda M: jnp.exp(jnp.sum(M[0])) * jnp.ones((1, 2)), convex=True)
 
 
 @pytest.mark.float32

@@ -20,6 +20,7 @@ class SetContract:
     projection_tolerance = 1e-11  # of feasibility and of the variational inequality, relative, in float64
     support_tolerance = 1e-13  # relative: rounding where the support function is a formula
     sharp = True  # whether support function and radius are the suprema, not upper bounds of them
+    measured = True  # whether the farthest point and the distance are exact, not bounds
     differentiable = True  # whether the derivative of the projection is the true one at generic points
 
     def feasible_set(self):
@@ -128,10 +129,32 @@ class SetContract:
         norms = np.linalg.norm(projected.reshape(len(projected), -1), axis=1)
         assert norms.max() <= float(radius) * (1 + self.close()) + self.close()
 
-    def test_bounded_sets_know_both_support_and_radius(self):
+    def test_bounded_sets_know_support_radius_and_farthest_point(self):
         feasible_set = self.feasible_set()
         unbounded = feasible_set.support(normal(21, *self.shape)) is None
         assert unbounded == (feasible_set.radius(self.shape) is None)
+        assert unbounded == (feasible_set.farthest(normal(21, *self.shape)) is None)
+        if not unbounded:
+            assert_close(feasible_set.farthest(jnp.zeros(self.shape)), feasible_set.radius(self.shape))
+
+    @pytest.mark.parametrize("scale", SCALES)
+    def test_farthest_and_distance_bound_what_is_found_and_are_reached_where_they_are_sharp(self, scale):
+        """Far steps away from the center, from zero or the middle of the set, end in its farthest points."""
+        feasible_set, center = self.feasible_set(), scale * np.asarray(normal(24, *self.shape))
+        points, projected = self.projected()
+        corners = [np.asarray(self.projection()(sign * 1e4 * points)) for sign in (1.0, -1.0)]
+        starts = np.concatenate([projected[:7], 0 * projected[:1], np.mean(corners, axis=(0, 1))[None]])
+        far = [np.asarray(self.projection()(center + 1e4 * (starts - center)))]
+        far.append(np.asarray(self.projection()(center + 1e4 * (far[0] - center))))
+        found = np.concatenate([*corners, projected, *far, self.projection()(np.repeat(center[None], 9, axis=0))])
+        lengths = np.linalg.norm((found - center).reshape(len(found), -1), axis=1)
+        farthest, distance = (getattr(feasible_set, name)(jnp.asarray(center)) for name in ("farthest", "distance"))
+        slack = 10 * self.close() * (1 + lengths.min())
+        assert float(distance) <= lengths.min() + slack
+        assert not self.measured or float(distance) >= lengths.min() - slack
+        if farthest is not None:
+            assert lengths.max() <= float(farthest) + slack
+            assert not self.measured or lengths.max() >= float(farthest) * (1 - 1e-6)
 
     def test_projection_is_affine_where_the_set_is_said_to_be(self):
         points, projected = self.projected()

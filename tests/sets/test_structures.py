@@ -47,6 +47,17 @@ def test_lifted_set_support_is_the_supremum_over_lifted_policies():
     assert_close(lifted_set.support(directions[0]), support[0])
 
 
+def test_lifted_set_measures_from_any_policy_also_one_outside_the_structure():
+    """‖lift θ - C‖ over a ball of θ: the part of C outside the structure, and √2 times that of θ from its free part."""
+    structure, lifted_set = pc.RepeatedBlock(2), LiftedSet(pc.FrobeniusBall(0.5), pc.RepeatedBlock(2), (2, 4, 6))
+    center = np.asarray(normal(3, 2, 4, 6))
+    basis = np.asarray(jax.vmap(structure.lift)(jnp.eye(12).reshape(12, 2, 2, 3))).reshape(12, -1).T
+    free, residual, *_ = np.linalg.lstsq(basis, center.reshape(-1), rcond=None)
+    reach = np.linalg.norm(free)
+    for value, inner in ((lifted_set.farthest, reach + 0.5), (lifted_set.distance, reach - 0.5)):
+        assert_close(value(jnp.asarray(center)), np.sqrt(2 * inner**2 + residual[0]))
+
+
 def test_lifted_set_of_an_unbounded_set_knows_no_radius_and_no_support():
     lifted_set = LiftedSet(pc.RowSum(1.0), pc.RepeatedBlock(2), (1, 4, 4))
     assert lifted_set.radius is None and lifted_set.support(normal(1, 1, 4, 4)) is None

@@ -10,7 +10,7 @@ from jaxtyping import Array, Key
 
 from perfcontrol._checks import as_array, fail
 from perfcontrol.perturbations.base import AbstractPerturbation, CovarianceOperator, DenseDraws, Draws, zero_mean
-from perfcontrol.perturbations.dependence import Dependence, check_values, largest_entries, matrix_slope_norm, slopes
+from perfcontrol.perturbations.dependence import check_values
 from perfcontrol.perturbations.scalar_laws import SCALAR_LAWS
 from perfcontrol.policy_maps import AbstractPolicyMap, as_policy_map, evaluate_map
 from perfcontrol.random_vectors import AbstractRandomVector
@@ -69,8 +69,8 @@ class DensePerturbation(AbstractPerturbation):
         InputError: unknown law, or shapes that do not fit (when the problem is built).
     """
 
-    scale: Dependence
-    mean_map: Dependence | None
+    scale: AbstractPolicyMap
+    mean_map: AbstractPolicyMap | None
     law: AbstractRandomVector | None
     kind: str = eqx.field(static=True)
     on_input: bool = eqx.field(static=True)
@@ -95,7 +95,7 @@ class DensePerturbation(AbstractPerturbation):
     def check(self, policy_shape: tuple[int, int, int], horizon: int) -> None:
         _, m, n = policy_shape
         p = self.columns(n, m)
-        dtype = jnp.result_type(float) if isinstance(self.scale, AbstractPolicyMap) else self.scale.dtype
+        dtype = jnp.result_type(float)
         check_values("scale", self.scale, policy_shape, [(), (horizon,), (n, p), (horizon, n, p)], dtype)
         if self.mean_map is not None:
             check_values("mean", self.mean_map, policy_shape, [(n, p), (horizon, n, p)], dtype)
@@ -155,14 +155,14 @@ class DensePerturbation(AbstractPerturbation):
         return _ColouredCovariance(scales, self._vector(M).covariance.reshape(*shape, *shape))
 
     def policy_free_mean(self) -> bool:
-        by_scale = self.law is not None and isinstance(self.scale, AbstractPolicyMap)
-        return not (by_scale or isinstance(self.mean_map, AbstractPolicyMap))
+        return (self.law is None or self.scale.constant) and (self.mean_map is None or self.mean_map.constant)
 
     def bound(self, feasible_set: Any, horizon: int) -> Array | None:
-        """sup ‖mean‖ + sup ‖scale Z‖_F; known for affine maps on a bounded set and a bounded law."""
+        """sup ‖mean‖ + sup ‖scale Z‖_F; known where the maps know their range and the law is bounded."""
         n, p = self._set_shape(feasible_set)
-        largest = largest_entries(self.scale, feasible_set)
-        if largest is None:
+        largest = self.scale.largest(feasible_set)
+        means = 0.0 if self.mean_map is None else self.mean_map.matrix_bound(feasible_set)
+        if largest is None or means is None:
             return None
         entrywise = jnp.broadcast_to(largest[..., None, None] if largest.ndim < 2 else largest, (horizon, n, p))
         if self.kind in SCALAR_LAWS:
@@ -172,34 +172,22 @@ class DensePerturbation(AbstractPerturbation):
             if norm is None:
                 return None
             total = norm * jnp.max(entrywise, axis=(-2, -1))
-        if self.mean_map is not None:
-            means = largest_entries(self.mean_map, feasible_set)
-            if means is None:
-                return None
-            # Entrywise suprema: only the Frobenius norm is monotone in them.
-            order = "fro" if isinstance(self.mean_map, AbstractPolicyMap) else 2
-            total = total + jnp.linalg.norm(means, ord=order, axis=(-2, -1))
-        return jnp.broadcast_to(total, (horizon,))
+        return jnp.broadcast_to(total + means, (horizon,))
 
     def sensitivity(self, feasible_set: Any, horizon: int) -> Array | None:
-        """‖mean slope‖ + √E‖(scale slope) Z‖²_F, by coupling both laws through the same Z; known for affine maps."""
+        """L + √E‖S ∘ Z‖²_F, by coupling both laws through the same Z; L and S Lipschitz constants of mean and scale."""
         n, p = self._set_shape(feasible_set)
-        slope = slopes(self.scale)
-        by_mean = jnp.zeros(()) if self.mean_map is None else matrix_slope_norm(self.mean_map)
-        if slope is None or by_mean is None:
-            return None
-        if self.law is None:
-            second = jnp.ones((n, p))
-        else:
+        second = jnp.ones((n, p))
+        if self.law is not None:
             law = self.law.resize(n * p)
             second = (jnp.diagonal(law.covariance) + law.mean**2).reshape(n, p)
-        if slope.ndim < 5:  # one scale for all entries
-            by_scale = jnp.sqrt(jnp.sum(slope**2, axis=tuple(range(-3, 0))) * jnp.sum(second)) if slope.ndim else 0.0
+        by_scale = self.scale.lipschitz(feasible_set)
+        if by_scale is not None and by_scale.ndim < 2:  # one scale for all entries
+            by_scale = by_scale * jnp.sqrt(jnp.sum(second))
         else:
-            weighted = slope * jnp.sqrt(second)[..., None, None, None]
-            flat = weighted.reshape(*slope.shape[:-5], n * p, -1)
-            by_scale = jnp.linalg.norm(flat, ord=2, axis=(-2, -1))
-        return jnp.broadcast_to(by_scale + by_mean, (horizon,))
+            by_scale = self.scale.matrix_lipschitz(feasible_set, jnp.sqrt(second))
+        by_mean = 0.0 if self.mean_map is None else self.mean_map.matrix_lipschitz(feasible_set)
+        return None if by_scale is None or by_mean is None else jnp.broadcast_to(by_scale + by_mean, (horizon,))
 
     def _set_shape(self, feasible_set: Any) -> tuple[int, int]:
         _, m, n = feasible_set.shape

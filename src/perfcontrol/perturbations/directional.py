@@ -10,7 +10,7 @@ from jaxtyping import Array, Key
 from perfcontrol._checks import as_array, fail
 from perfcontrol._linalg import Matrix, as_dense, matvec, rmatvec
 from perfcontrol.perturbations.base import AbstractPerturbation, CovarianceOperator, Draws, zero_mean
-from perfcontrol.perturbations.dependence import check_values, largest_entries, matrix_slope_norm, slopes
+from perfcontrol.perturbations.dependence import check_values
 from perfcontrol.perturbations.scalar_laws import SCALAR_LAWS
 from perfcontrol.policy_maps import AbstractPolicyMap, as_policy_map, evaluate_map
 
@@ -84,8 +84,8 @@ class DirectionalPerturbation(AbstractPerturbation):
     """
 
     directions: Array
-    scale: AbstractPolicyMap | Array
-    mean_map: AbstractPolicyMap | Array | None
+    scale: AbstractPolicyMap
+    mean_map: AbstractPolicyMap | None
     law: str = eqx.field(static=True)
 
     def __init__(self, directions: Any, scale: Any, mean: Any = None, law: str = "rademacher"):
@@ -143,37 +143,24 @@ class DirectionalPerturbation(AbstractPerturbation):
         return DirectionalCovariance(self.scales(M, horizon) ** 2, self.directions)
 
     def policy_free_mean(self) -> bool:
-        return not isinstance(self.mean_map, AbstractPolicyMap)
+        return self.mean_map is None or self.mean_map.constant
 
     def bound(self, feasible_set: Any, horizon: int) -> Array | None:
-        """Σ_k sup|scale_k| sup|ζ| ‖D_k‖ + sup‖mean‖; known for affine maps on a bounded set."""
-        scales = largest_entries(self.scale, feasible_set)
-        if scales is None:
+        """Σ_k sup|scale_k| sup|ζ| ‖D_k‖ + sup‖mean‖; known where the maps know their range."""
+        scales = self.scale.largest(feasible_set)
+        means = 0.0 if self.mean_map is None else self.mean_map.matrix_bound(feasible_set)
+        if scales is None or means is None:
             return None
         norms = jnp.linalg.norm(self.directions, ord=2, axis=(-2, -1))
-        total = SCALAR_LAWS[self.law].bound * jnp.sum(scales * norms, axis=-1)
-        if self.mean_map is not None:
-            means = largest_entries(self.mean_map, feasible_set)
-            if means is None:
-                return None
-            constant = not isinstance(self.mean_map, AbstractPolicyMap)
-            order = 2 if constant else "fro"  # entrywise suprema: only the Frobenius norm is monotone in them
-            total = total + jnp.linalg.norm(means, ord=order, axis=(-2, -1))
+        total = SCALAR_LAWS[self.law].bound * jnp.sum(scales * norms, axis=-1) + means
         return jnp.broadcast_to(total, (horizon,))
 
     def sensitivity(self, feasible_set: Any, horizon: int) -> Array | None:
-        """Σ_k ‖slope_k‖_F E|ζ| ‖D_k‖ + ‖mean slope‖: couples both laws by the same ζ; known for affine maps."""
-        by_scale = slopes(self.scale)
-        if by_scale is None:
+        """Σ_k L_k E|ζ| ‖D_k‖ + L: couples both laws by the same ζ; L_k, L Lipschitz constants of scales and mean."""
+        by_scale = self.scale.lipschitz(feasible_set)
+        by_mean = 0.0 if self.mean_map is None else self.mean_map.matrix_lipschitz(feasible_set)
+        if by_scale is None or by_mean is None:
             return None
         norms = jnp.linalg.norm(self.directions, ord=2, axis=(-2, -1))
-        per_direction = (
-            jnp.sqrt(jnp.sum(by_scale**2, axis=(-3, -2, -1))) * norms if by_scale.ndim else jnp.zeros_like(norms)
-        )
-        total = SCALAR_LAWS[self.law].mean_absolute * jnp.sum(per_direction, axis=-1)
-        if self.mean_map is not None:
-            by_mean = matrix_slope_norm(self.mean_map)
-            if by_mean is None:
-                return None
-            total = total + by_mean
+        total = SCALAR_LAWS[self.law].mean_absolute * jnp.sum(by_scale * norms, axis=-1) + by_mean
         return jnp.broadcast_to(total, (horizon,))

@@ -9,8 +9,8 @@ from jaxtyping import Array, Key
 from perfcontrol._checks import as_array, fail, is_concrete
 from perfcontrol._linalg import matvec, rmatvec
 from perfcontrol.perturbations.base import AbstractPerturbation, CovarianceOperator, Draws
-from perfcontrol.perturbations.dependence import Dependence, check_values, slopes
-from perfcontrol.policy_maps import AbstractPolicyMap, as_policy_map, evaluate_map
+from perfcontrol.perturbations.dependence import check_values
+from perfcontrol.policy_maps import AbstractPolicyMap, ConstantMap, as_policy_map, evaluate_map
 
 
 class _FiniteDraws(Draws):
@@ -77,7 +77,7 @@ class FinitePerturbation(AbstractPerturbation):
     """
 
     values: Array
-    probabilities: Dependence
+    probabilities: AbstractPolicyMap
 
     def __init__(self, values: Any, probabilities: Any):
         self.values = as_array("values", values)
@@ -85,8 +85,7 @@ class FinitePerturbation(AbstractPerturbation):
             required = "have shape (k, n, p) or (T, k, n, p)"
             raise fail("values", f"{self.values.shape}", required, "A single matrix V is passed as [V].")
         self.probabilities = as_policy_map("probabilities", probabilities)
-        constant = self.probabilities
-        if isinstance(constant, AbstractPolicyMap) or not is_concrete(constant):
+        if not isinstance(self.probabilities, ConstantMap) or not is_concrete(constant := self.probabilities.value):
             return
         if constant.ndim == 0 or not bool(jnp.all(_is_distribution(constant))):
             got = f"least entry {float(jnp.min(constant)):.3g} and sums {jnp.sum(jnp.atleast_1d(constant), axis=-1)}"
@@ -133,7 +132,7 @@ class FinitePerturbation(AbstractPerturbation):
         return _FiniteCovariance(self.distribution(M, horizon), self.mean(M, horizon), self.values)
 
     def policy_free_mean(self) -> bool:
-        return not isinstance(self.probabilities, AbstractPolicyMap)
+        return self.probabilities.constant
 
     def bound(self, feasible_set: Any, horizon: int) -> Array:
         """max_j ‖values[t, j]‖, whatever the policy."""
@@ -141,16 +140,13 @@ class FinitePerturbation(AbstractPerturbation):
         return jnp.broadcast_to(jnp.max(norms, axis=-1), (horizon,))
 
     def sensitivity(self, feasible_set: Any, horizon: int) -> Array | None:
-        """Σ_j ‖slope_j‖_F min(½ diameter, ‖V_j - V̄‖ for all j): probability moved times the way; for affine maps.
+        """Σ_j L_j min(½ diameter, ‖V_j - V̄‖ for all j): probability moved times the way; L_j the Lipschitz constants.
 
         Moving Σ_j |dp_j| / 2 at most the diameter, or all of it through the average V̄ of the values.
         """
-        slope = slopes(self.probabilities)
-        if slope is None:
+        moved = self.probabilities.lipschitz(feasible_set)
+        if moved is None:
             return None
-        if slope.ndim == 0:
-            return jnp.zeros(horizon, self.values.dtype)
-        moved = jnp.sqrt(jnp.sum(slope**2, axis=(-3, -2, -1)))  # sup |dp_j| over unit steps
         apart = self.values[..., :, None, :, :] - self.values[..., None, :, :, :]
         diameter = jnp.max(jnp.linalg.norm(apart, ord=2, axis=(-2, -1)), axis=(-2, -1))
         centre = jnp.mean(self.values, axis=-3, keepdims=True)

@@ -33,3 +33,28 @@ class Affine(AbstractPolicyMap):
 
     def __call__(self, M: Array) -> Array:
         return self.offset + jnp.tensordot(self.slope, M, axes=3)
+
+    def range(self, feasible_set: Any) -> tuple[Array, Array] | None:
+        """Exact where the support function of the set is; None where it may be infinite."""
+        below, above = feasible_set.support(-self.slope), feasible_set.support(self.slope)
+        return None if below is None or above is None else (self.offset - below, self.offset + above)
+
+    def lipschitz(self, feasible_set: Any) -> Array:
+        return jnp.sqrt(jnp.sum(self.slope**2, axis=(-3, -2, -1)))
+
+    def matrix_lipschitz(self, feasible_set: Any, weights: Any = 1.0) -> Array:
+        """The largest singular value of the derivative."""
+        slope = jnp.asarray(weights)[..., None, None, None] * self.slope
+        *time, rows, columns = self.offset.shape
+        return jnp.linalg.norm(slope.reshape(*time, rows * columns, -1), ord=2, axis=(-2, -1))
+
+    def derivative(self) -> Array:
+        return self.slope
+
+    @property
+    def continuous(self) -> bool:
+        return True
+
+    @property
+    def convex(self) -> bool:
+        return True

@@ -1,6 +1,7 @@
-"""How a quantity depends on the policy: an affine map with known Lipschitz constant, or any function.
+"""The interface of a policy map: how a quantity depends on the policy, and what is known of it over a set.
 
-Most maps give an array; one that says how the noise reacts gives the law of a random vector.
+Most maps give an array; one that says how the noise reacts gives the law of a random vector. Families and theory ask
+a map what it knows, whatever its kind; None always means "not known". Sets are sets of lifted policies (`LiftedSet`).
 """
 
 import abc
@@ -18,8 +19,45 @@ class AbstractPolicyMap(eqx.Module):
     def __call__(self, M: Array) -> Any:
         """The value at the policy M."""
 
+    def range(self, feasible_set: Any) -> tuple[Array, Array] | None:
+        """Numbers that the entries stay between over the set: low and high, each of the value's shape."""
+        return None
 
-def evaluate_map(policy_map: AbstractPolicyMap | Array, M: Array) -> Array:
-    """The value of a policy map, or of a constant, at M; in the precision of M."""
-    value = policy_map(M) if isinstance(policy_map, AbstractPolicyMap) else policy_map
-    return jnp.asarray(value).astype(M.dtype)
+    def lipschitz(self, feasible_set: Any) -> Array | None:
+        """Lipschitz constants of the entries over the set, per unit of ‖M - M'‖_F; of the value's shape."""
+        return None
+
+    def largest(self, feasible_set: Any) -> Array | None:
+        """A bound of |entries| over the set."""
+        bounds = self.range(feasible_set)
+        return None if bounds is None else jnp.maximum(jnp.abs(bounds[0]), jnp.abs(bounds[1]))
+
+    def matrix_bound(self, feasible_set: Any) -> Array | None:
+        """A bound over the set of the spectral norm of a matrix-valued map, () or (T,)."""
+        # Entry by entry only the Frobenius norm is monotone.
+        entries = self.largest(feasible_set)
+        return None if entries is None else jnp.linalg.norm(entries, axis=(-2, -1))
+
+    def matrix_lipschitz(self, feasible_set: Any, weights: Any = 1.0) -> Array | None:
+        """A Lipschitz constant in Frobenius norm of a matrix-valued map times weights (n, p), () or (T,)."""
+        entries = self.lipschitz(feasible_set)
+        return None if entries is None else jnp.linalg.norm(weights * entries, axis=(-2, -1))
+
+    def derivative(self) -> Array | None:
+        """The derivative by M where it is the same at every policy, of shape value.shape + (memory, input, state)."""
+        return None
+
+    @property
+    def constant(self) -> bool:
+        """Whether the value is known to be the same for every policy, whatever the set."""
+        return False
+
+    @property
+    def continuous(self) -> bool | None:
+        """True where the value is proved to be continuous in M."""
+        return None
+
+    @property
+    def convex(self) -> bool | None:
+        """Whether {M : |entry| ≤ s} is convex for every entry and every s."""
+        return None

@@ -30,6 +30,15 @@ class AbstractSet(eqx.Module):
         """sup ‖M‖_F over the set, for policies of that shape; None if unbounded."""
         return None
 
+    def farthest(self, center: Array) -> Array | None:
+        """sup ‖M - center‖_F over the set, or a bound of it; None if unbounded."""
+        radius = self.radius(center.shape)
+        return None if radius is None else radius + jnp.linalg.norm(center.reshape(-1))
+
+    def distance(self, center: Array) -> Array:
+        """inf ‖M - center‖_F over the set, or a bound of it."""
+        return jnp.linalg.norm((center - self.project(center)).reshape(-1))
+
     @property
     def row_total(self) -> Array | None:
         """The sum of every row where the set fixes it, else None."""
@@ -65,6 +74,22 @@ class LiftedSet(eqx.Module):
         """sup ‖M‖_F of the lifted policies (an upper bound under a structure)."""
         inner = self.inner.radius(self.structure.free_shape(self.shape))
         return None if inner is None else self.structure.norm * inner
+
+    def farthest(self, center: Array) -> Array | None:
+        """sup ‖M - center‖_F, or a bound of it; None if unbounded."""
+        free, outside = self._split(center)
+        inner = self.inner.farthest(free)
+        return None if inner is None else jnp.hypot(self.structure.norm * inner, outside)
+
+    def distance(self, center: Array) -> Array:
+        """inf ‖M - center‖_F, or a bound of it."""
+        free, outside = self._split(center)
+        return jnp.hypot(self.structure.norm * self.inner.distance(free), outside)
+
+    def _split(self, center: Array) -> tuple[Array, Array]:
+        """The free parameters nearest to a policy, and the length of what lies outside the structure."""
+        free = self.structure.adjoint(center) / self.structure.norm**2
+        return free, jnp.linalg.norm((center - self.structure.lift(free)).reshape(-1))
 
     @property
     def row_total(self) -> Array | None:

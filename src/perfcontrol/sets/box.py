@@ -60,11 +60,14 @@ class Box(AbstractSet):
             return None
         return jnp.sum(jnp.where(direction > 0, self.high, self.low) * direction, axis=(-3, -2, -1))
 
-    def radius(self, shape: tuple[int, ...]) -> Array | None:
+    def farthest(self, center: Array) -> Array | None:
+        """At a corner."""
         if not self._bounded():
             return None
-        largest = jnp.maximum(jnp.abs(self.low), jnp.abs(self.high))
-        return jnp.linalg.norm(jnp.broadcast_to(largest, shape).reshape(-1))
+        return jnp.linalg.norm(jnp.maximum(jnp.abs(self.low - center), jnp.abs(self.high - center)).reshape(-1))
+
+    def radius(self, shape: tuple[int, ...]) -> Array | None:
+        return self.farthest(jnp.zeros(shape, self.low.dtype))
 
     def _bounded(self) -> bool:
         """Whether both bounds are finite; traced ones are taken to be."""

@@ -22,6 +22,7 @@ from jaxtyping import Array, Float, Int
 from perfcontrol._checks import fail, is_concrete
 from perfcontrol._linalg import symmetrise, transpose
 from perfcontrol.sets.base import AbstractSet
+from perfcontrol.sets.rows import RowSimplex
 
 SWEEPS = 20  # of Dykstra between two Newton steps
 ROUNDS = 12  # of sweeps and a Newton step in a stage, at first; doubled when a stage fails
@@ -298,8 +299,7 @@ class Intersection(AbstractSet):
             return self.sets[0].support(direction)
         flat = direction.reshape(-1, *shape)
         best = jax.lax.map(lambda d: _support(self.sets, d, reach.astype(d.dtype)), flat).reshape(direction.shape[:-3])
-        known = [value for member in self.sets if (value := member.support(direction)) is not None]
-        return jnp.min(jnp.stack([best, *known]), axis=0)
+        return _least([best, *(member.support(direction) for member in self.sets)])
 
     @property
     def affine(self) -> bool:
@@ -307,10 +307,21 @@ class Intersection(AbstractSet):
 
     def radius(self, shape: tuple[int, ...]) -> Array | None:
         """An upper bound: the least of the sets' radii."""
-        known = [value for member in self.sets if (value := member.radius(shape)) is not None]
-        if self.nonnegative and self.row_total is not None:
-            known.append(jnp.linalg.norm(jnp.broadcast_to(self.row_total, shape[:-1])))
-        return None if not known else jnp.min(jnp.stack(known))
+        return _least([member.radius(shape) for member in self._around])
+
+    def farthest(self, center: Array) -> Array | None:
+        """An upper bound: the least of the sets'."""
+        return _least([member.farthest(center) for member in self._around])
+
+    def distance(self, center: Array) -> Array:
+        """A lower bound: the largest of the sets'."""
+        return jnp.max(jnp.stack([member.distance(center) for member in self._around]))
+
+    @property
+    def _around(self) -> Sets:
+        """Sets that the intersection is known to lie in."""
+        fixed = self.nonnegative and self.row_total is not None
+        return (*self.sets, RowSimplex(self.row_total)) if fixed else self.sets
 
     @property
     def row_total(self) -> Array | None:
@@ -320,3 +331,9 @@ class Intersection(AbstractSet):
     @property
     def nonnegative(self) -> bool:
         return any(member.nonnegative for member in self.sets)
+
+
+def _least(bounds: list[Array | None]) -> Array | None:
+    """The least of those that are known, entry by entry."""
+    known = [bound for bound in bounds if bound is not None]
+    return jnp.min(jnp.stack(known), axis=0) if known else None

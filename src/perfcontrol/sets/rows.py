@@ -84,8 +84,13 @@ class RowSimplex(_Rows):
     def support(self, direction: Array) -> Array:
         return jnp.sum(self.total * jnp.max(direction, axis=-1), axis=(-2, -1))
 
+    def farthest(self, center: Array) -> Array:
+        """At the vertex that puts the whole of each row where the center is least."""
+        vertex = jnp.argmin(center, axis=-1, keepdims=True) == jnp.arange(center.shape[-1])
+        return jnp.linalg.norm((self.total[..., None] * vertex - center).reshape(-1))
+
     def radius(self, shape: tuple[int, ...]) -> Array:
-        return jnp.linalg.norm(jnp.broadcast_to(self.total, shape[:-1]))
+        return self.farthest(jnp.zeros(shape, self.total.dtype))
 
     @property
     def nonnegative(self) -> bool:

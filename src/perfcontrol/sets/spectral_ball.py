@@ -71,16 +71,23 @@ class SpectralBall(AbstractSet):
     def project(self, M: Array) -> Array:
         """Singular values of the stacked matrix above the radius are set to it."""
         H, m, n = M.shape
-        stacked = M.transpose(1, 0, 2).reshape(m, H * n)
-        clipped = clip_singular_values(stacked, self.limit.astype(M.dtype))
+        clipped = clip_singular_values(_stacked(M), self.limit.astype(M.dtype))
         return clipped.reshape(m, H, n).transpose(1, 0, 2)
 
     def support(self, direction: Array) -> Array:
         """The radius times the nuclear norm of the stacked direction."""
-        H, m, n = direction.shape[-3:]
-        stacked = jnp.swapaxes(direction, -3, -2).reshape(*direction.shape[:-3], m, H * n)
-        return self.limit * jnp.sum(jnp.linalg.svd(stacked, compute_uv=False), axis=-1)
+        return self.limit * jnp.sum(jnp.linalg.svd(_stacked(direction), compute_uv=False), axis=-1)
+
+    def farthest(self, center: Array) -> Array:
+        """At -radius U Vᵀ for the stacked center U S Vᵀ: largest in norm, and the most against the center."""
+        return jnp.linalg.norm(self.limit + jnp.linalg.svd(_stacked(center), compute_uv=False))
 
     def radius(self, shape: tuple[int, ...]) -> Array:
         H, m, n = shape
         return self.limit * jnp.sqrt(jnp.asarray(min(m, H * n), self.limit.dtype))
+
+
+def _stacked(M: Array) -> Array:
+    """The lags side by side, (..., m, H n)."""
+    H, m, n = M.shape[-3:]
+    return jnp.swapaxes(M, -3, -2).reshape(*M.shape[:-3], m, H * n)

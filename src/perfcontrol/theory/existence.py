@@ -13,7 +13,6 @@ import numpy as np
 
 from perfcontrol.costs import QuadraticCost
 from perfcontrol.perturbations import DirectionalPerturbation, NoPerturbation
-from perfcontrol.policy_maps import AbstractPolicyMap, Affine
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.theory.derivatives import hessian_without_reaction, tangent_basis
 
@@ -51,7 +50,7 @@ def bounded_response(problem: PerformativeProblem) -> bool:
     if not isinstance(problem.cost, QuadraticCost) or not problem.feasible_set.affine or problem.noise_reacts:
         return False
     if isinstance(law, DirectionalPerturbation):
-        if isinstance(law.mean_map, AbstractPolicyMap) and not constant_mean(problem):
+        if not constant_mean(problem):
             return False
     elif not isinstance(law, NoPerturbation):
         return False
@@ -71,8 +70,9 @@ def constant_mean(problem: PerformativeProblem) -> bool:
     if getattr(problem.perturbation, "portfolio", None) is not None:  # the stock market: the mean follows row sums
         return problem.feasible_set.row_total is not None
     mean_map = getattr(law, "mean_map", None)
-    if not isinstance(mean_map, Affine):
+    derivative = None if mean_map is None else mean_map.derivative()
+    if derivative is None:
         return False
-    slopes = mean_map.slope.reshape(-1, *problem.lifted_shape)
+    slopes = derivative.reshape(-1, *problem.lifted_shape)
     free = np.asarray(jax.vmap(problem.structure.adjoint)(slopes)).reshape(slopes.shape[0], -1)
     return bool(np.max(np.abs(free @ tangent_basis(problem)), initial=0.0) <= 1e-12 * (1 + np.max(np.abs(free))))

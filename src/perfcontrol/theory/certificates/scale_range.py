@@ -7,7 +7,6 @@ import numpy as np
 
 from perfcontrol._checks import as_array, fail
 from perfcontrol.perturbations import DirectionalPerturbation
-from perfcontrol.policy_maps import AbstractPolicyMap, Affine
 from perfcontrol.problem import PerformativeProblem
 
 
@@ -36,17 +35,16 @@ def scale_range(problem: PerformativeProblem, declared: Any = None) -> ScaleRang
         if np.any(low > high) or np.any(lipschitz < 0):
             raise fail("scale_range", "low > high or a negative Lipschitz constant", "be ordered", "Check the order.")
         return ScaleRange(low, high, None, lipschitz)
-    if not isinstance(law.scale, AbstractPolicyMap):
-        return ScaleRange(full(law.scale), full(law.scale), np.zeros((*shape, size)), np.zeros(shape))
-    if not isinstance(law.scale, Affine):
-        return "the scales are a general function: declare scale_range=(low, high, Lipschitz constant)"
-    flat = law.scale.slope.reshape(-1, *problem.lifted_shape)
-    upper, lower = problem.lifted_set.support(flat), problem.lifted_set.support(-flat)
-    if upper is None or lower is None:
+    bounds, lipschitz = law.scale.range(problem.lifted_set), law.scale.lipschitz(problem.lifted_set)
+    if bounds is None or lipschitz is None:
+        if not law.scale.continuous:
+            return "the scales are a general function: declare scale_range=(low, high, Lipschitz constant)"
         return "the scales are not known to be bounded on this feasible set: declare scale_range, or bound the set"
-    offset = np.asarray(law.scale.offset, dtype=float)
-    low = full(offset - np.asarray(lower, dtype=float).reshape(offset.shape))
-    high = full(offset + np.asarray(upper, dtype=float).reshape(offset.shape))
-    slopes = np.asarray(jax.vmap(problem.structure.adjoint)(flat), dtype=float).reshape(*offset.shape, size)
+    low, high = full(bounds[0]), full(bounds[1])
+    derivative = law.scale.derivative()
+    if derivative is None:
+        return ScaleRange(low, high, None, full(lipschitz) * problem.structure.norm)
+    slopes = jax.vmap(problem.structure.adjoint)(derivative.reshape(-1, *problem.lifted_shape))
+    slopes = np.asarray(slopes, dtype=float).reshape(*derivative.shape[:-3], size)
     slopes = np.broadcast_to(slopes, (*shape, size))
     return ScaleRange(low, high, slopes, np.linalg.norm(slopes, axis=-1))
