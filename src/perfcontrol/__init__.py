@@ -30,7 +30,7 @@ from perfcontrol.perturbations import (
     StockPerturbation,
 )
 from perfcontrol.policy import DisturbanceAction
-from perfcontrol.policy_maps import Affine, Function
+from perfcontrol.policy_maps import Affine, Function, Norm
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.random_vectors import (
     AbstractRandomVector,
@@ -120,6 +120,7 @@ __all__ = [
     "Linear",
     "LinearSystem",
     "NoPerturbation",
+    "Norm",
     "Pathwise",
     "PerformativeProblem",
     "QuadraticCost",

@@ -43,7 +43,7 @@ class PolicyMapContract:
         self, (feasible_set, structure) = cls(), SETS[name]
         policy_map, free = self.policy_map(), structure.free_shape(self.shape)
         count = evaluate_map(policy_map, jnp.zeros(self.shape)).size
-        starts = jnp.concatenate([scale * normal(51, STARTS // 2, *free) for scale in (0.1, 2.0)])
+        starts = normal(51, STARTS, *free) * jnp.linspace(0, 1.5, STARTS)[:, None, None, None] ** 3  # the first is 0
         entries, signs = jnp.arange(count), jnp.asarray([1.0, -1.0])
 
         def end(start, entry, sign):

@@ -48,6 +48,14 @@ class TestPerformativeInputMatrix(PerturbationContract):
         )
 
 
+class TestScalesByTheNorm(PerturbationContract):
+    """Scales of both signs, and a mean that grows with the distance from a policy."""
+
+    def perturbation(self):
+        mean = pc.Norm(np.zeros((3, 3)), 0.3 * normal(14, 3, 3), center=normal(15, 2, 2, 3), squared=True)
+        return pc.DirectionalPerturbation(DIRECTIONS, pc.Norm([0.5, 0.3], [0.4, -0.6]), mean)
+
+
 class TestFunctionOfThePolicy(PerturbationContract):
     knows = ("mean", "covariance")
 

@@ -6,5 +6,6 @@ from perfcontrol.policy_maps.constant import ConstantMap as ConstantMap
 from perfcontrol.policy_maps.convert import as_policy_map as as_policy_map
 from perfcontrol.policy_maps.convert import evaluate_map as evaluate_map
 from perfcontrol.policy_maps.function import Function
+from perfcontrol.policy_maps.norm import Norm
 
-__all__ = ["AbstractPolicyMap", "Affine", "Function"]
+__all__ = ["AbstractPolicyMap", "Affine", "Function", "Norm"]

@@ -1,5 +1,6 @@
 """The certificates against exact evaluation: nothing that is called proved may ever fail."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -38,7 +39,25 @@ def norms(M):
 @settings(max_examples=6, deadline=None, derandomize=True)
 @given(seed=st.integers(0, 10_000), skew=st.sampled_from([0.0, 2.0]), strength=st.sampled_from([1e-4, 1e-2, 0.3]))
 def test_contraction_bounds_are_never_exceeded_and_order_as_proved(seed, skew, strength):
-    problem = random_problem(seed, skew=skew, strength=strength)
+    assert_contraction_bounds_hold(random_problem(seed, skew=skew, strength=strength), seed)
+
+
+@pytest.mark.parametrize("squared", [False, True])
+def test_scales_by_the_norm_are_certified_on_a_bounded_set_without_declarations(squared):
+    """Contraction bounds hold, and are those of the range and Lipschitz constants worked out by hand."""
+    base, r = random_problem(5, strength=0.0), np.random.default_rng(5)
+    offset, weight = r.uniform(0.1, 0.3, (5, 2)), r.uniform(-0.1, 0.1, (5, 2))
+    scale = pc.Norm(offset, weight, 0.3 * r.standard_normal((2, 1, 2)), squared)
+    problem = eqx.tree_at(lambda p: p.perturbation.scale, base, scale)
+    assert_contraction_bounds_hold(problem, 5)
+    radius, center = float(problem.feasible_set.limit), float(np.linalg.norm(scale.center))
+    near, far = max(center - radius, 0.0), center + radius
+    ends = np.sort([offset + weight * reach ** (2 if squared else 1) for reach in (near, far)], axis=0)
+    declared = pc.certify(problem, "global", scale_range=(*ends, np.abs(weight) * (2 * far if squared else 1)))
+    assert pc.certify(problem, "global").rate == pytest.approx(declared.rate, rel=1e-9)
+
+
+def assert_contraction_bounds_hold(problem, seed):
     first, second = feasible_pairs(problem, seed)
     moved = np.asarray(responses(problem, first) - responses(problem, second))
     rigorous, bound = pc.certify(problem, "rigorous"), pc.certify(problem, "global")
