@@ -20,6 +20,7 @@ from perfcontrol.evaluate import (
     simulate,
     state_moments,
 )
+from perfcontrol.fit import Fit, Logs, fit
 from perfcontrol.perturbations import (
     AbstractPerturbation,
     DensePerturbation,
@@ -108,6 +109,7 @@ __all__ = [
     "Estimate",
     "Exact",
     "FinitePerturbation",
+    "Fit",
     "FrobeniusBall",
     "FullStructure",
     "Function",
@@ -119,6 +121,7 @@ __all__ = [
     "Lazy",
     "Linear",
     "LinearSystem",
+    "Logs",
     "NoPerturbation",
     "Norm",
     "Pathwise",
@@ -151,6 +154,7 @@ __all__ = [
     "expected_cost_by_moments",
     "expected_gradient",
     "experiments",
+    "fit",
     "path_gradient",
     "recover_noise",
     "residual",

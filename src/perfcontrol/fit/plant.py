@@ -1,0 +1,70 @@
+"""The problem that fitted numbers make."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from perfcontrol.fit.features import Features
+from perfcontrol.fit.logs import Logs
+from perfcontrol.perturbations import AbstractPerturbation, DirectionalPerturbation, NoPerturbation
+from perfcontrol.problem import PerformativeProblem
+from perfcontrol.random_vectors import AbstractRandomVector, Constant, Gaussian
+from perfcontrol.systems import LinearSystem
+
+
+class Coefficients(eqx.Module):
+    """Everything that a fitted problem is built from; a leading axis makes a stack.
+
+    A, B, noise mean and covariance; mean (n, p, 1+q) and scale (k, 1+q): coefficients by the features of the policy.
+    """
+
+    A: Any
+    B: Any
+    noise_mean: Any
+    noise_covariance: Any
+    mean: Any
+    scale: Any
+
+
+def build(
+    c: Coefficients,
+    directions: np.ndarray,
+    mean: Features,
+    scale: Features,
+    *,
+    gain: np.ndarray,
+    law: str,
+    **world: Any,
+) -> PerformativeProblem:
+    """The problem; works under vmap over `c`."""
+    c = jax.tree.map(lambda numbers: jnp.asarray(numbers, float), c)
+    return PerformativeProblem(
+        system=LinearSystem(c.A, c.B),
+        gain=gain if gain.ndim else float(gain),
+        noise=Gaussian(c.noise_mean, c.noise_covariance),
+        perturbation=_perturbation(c, directions, mean, scale, law),
+        **world,
+    )
+
+
+def _perturbation(
+    c: Coefficients, directions: np.ndarray, mean: Features, scale: Features, law: str
+) -> AbstractPerturbation:
+    reaction = mean.as_map(c.mean) if c.mean.shape[-1] > 1 else None
+    if len(directions):
+        return DirectionalPerturbation(directions, scale.as_map(c.scale), reaction, law)
+    if reaction is not None:
+        return DirectionalPerturbation(np.zeros((1, *c.mean.shape[:2])), jnp.zeros(1), reaction, law)
+    return NoPerturbation()
+
+
+def logged_start(logs: Logs) -> AbstractRandomVector:
+    """The law of x_0: mean and covariance of the logged first states."""
+    first = np.stack([x[0] for x in logs.x])
+    if np.ptp(first, axis=0).max() == 0:
+        return Constant(first[0])
+    centred = first - first.mean(axis=0)
+    return Gaussian(first.mean(axis=0), centred.T @ centred / len(first))

@@ -1,0 +1,61 @@
+"""What logs leave open, in words."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from perfcontrol.fit.features import Features
+from perfcontrol.fit.location import Location
+from perfcontrol.fit.transitions import Transitions
+
+
+class Gap(NamedTuple):
+    """text: what is not known, and what would tell. blocks: whether A or B is part of it."""
+
+    text: str
+    blocks: bool
+
+
+def gaps(data: Transitions, location: Location, mean: Features, scale: Features) -> list[Gap]:
+    """Everything that these logs cannot tell, the gravest first."""
+    n, m = data.x.shape[1], data.v.shape[1]
+    found = []
+    for direction in _directions(location.unidentified[n : n + m]):
+        found.append(
+            Gap(
+                f"B along the input direction {_shown(direction)}: u + K x never moves there, so that only A - B K is "
+                "known (deploy a policy that acts there)",
+                True,
+            )
+        )
+    for direction in _directions(location.unidentified[:n]):
+        text = f"A along the state direction {_shown(direction)}: the state does not move there"
+        found.append(Gap(text + " by itself (start episodes elsewhere)", True))
+    policies = data.policies.reshape(len(data.policies), -1)
+    if len(policies) == 1:
+        found.append(Gap("any reaction: only one policy was deployed (deploy a second)", False))
+        return found
+    for what, features in (("mean dynamics", mean), ("perturbation scales", scale)):
+        values = features.values(data.policies)
+        short = values.shape[1] - np.linalg.matrix_rank(values, tol=1e-9 * np.abs(values).max())
+        if short:
+            text = f"how the {what} follow the policy: {len(policies)} policies do not tell {values.shape[1]}"
+            found.append(Gap(f"{text} coefficients of '{features.name}' apart", False))
+    tried = int(np.linalg.matrix_rank(policies - policies[0], tol=1e-9 * max(np.abs(policies).max(), 1e-300)))
+    if tried < policies.shape[1] and "affine" in (mean.name, scale.name):
+        text = f"slopes of the reaction in {policies.shape[1] - tried} of {policies.shape[1]} directions of the policy"
+        found.append(Gap(text + ": never tried, taken as zero", False))
+    return found
+
+
+def _directions(rows: np.ndarray) -> np.ndarray:
+    """An orthonormal basis of what the columns of `rows` span, one vector a row."""
+    if rows.size == 0:
+        return np.zeros((0, len(rows)))
+    vectors, sizes, _ = np.linalg.svd(rows, full_matrices=False)
+    return vectors[:, sizes > 1e-9 * max(1.0, sizes.max())].T
+
+
+def _shown(direction: np.ndarray) -> str:
+    leading = direction[np.argmax(np.abs(direction))]
+    return "[" + ", ".join(f"{x:.2g}" for x in np.round(direction / np.sign(leading), 9) + 0.0) + "]"
