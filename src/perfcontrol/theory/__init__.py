@@ -4,11 +4,16 @@ Host-level: NumPy and SciPy around the exact engine; nothing here promises to wo
 """
 
 from perfcontrol.theory.assumptions import Assumption
-from perfcontrol.theory.certificates.certificate import KINDS, Certificate
-from perfcontrol.theory.certificates.certify import certify
+from perfcontrol.theory.certificates.certificate import Certificate
+from perfcontrol.theory.certificates.certify import KINDS, certify
+from perfcontrol.theory.certificates.global_bound import GlobalBound
+from perfcontrol.theory.certificates.kind import AbstractCertificateKind
+from perfcontrol.theory.certificates.paper import Paper
 from perfcontrol.theory.certificates.report import certificate_row, verdict_rows
+from perfcontrol.theory.certificates.rigorous import Rigorous
+from perfcontrol.theory.certificates.sharp import Sharp
 from perfcontrol.theory.derivatives import hessian, reaction_jacobian
-from perfcontrol.theory.existence import existence
+from perfcontrol.theory.existence import Existence, existence
 from perfcontrol.theory.rates.error_bounds import rrm_error_bound, rsgd_error_bound
 from perfcontrol.theory.rates.orders import OrderVerdict, compare_orders, order_by_bound
 from perfcontrol.theory.rates.propositions import (
@@ -27,12 +32,18 @@ from perfcontrol.theory.stability.strong_stability import StrongStability, stron
 
 __all__ = [
     "KINDS",
+    "AbstractCertificateKind",
     "Assumption",
     "Certificate",
+    "Existence",
+    "GlobalBound",
     "MeanSquareStability",
     "OrderVerdict",
+    "Paper",
+    "Rigorous",
     "SensitivityEnvelope",
     "SensitivityEstimate",
+    "Sharp",
     "StrongStability",
     "SumThreshold",
     "TheoremStepSize",

@@ -5,6 +5,7 @@ best response is Φ' = -𝐇⁻¹𝐄 where no constraint is active, that of pro
 derivative of the projection.
 """
 
+import math
 from collections.abc import Callable
 
 import equinox as eqx
@@ -15,6 +16,7 @@ from jaxtyping import Array
 
 from perfcontrol._checks import fail
 from perfcontrol._linalg import along_time
+from perfcontrol.costs import QuadraticCost
 from perfcontrol.evaluate.exact import exact_gradient
 from perfcontrol.perturbations import NoPerturbation
 from perfcontrol.problem import PerformativeProblem
@@ -29,6 +31,24 @@ def check_problem(problem: object) -> PerformativeProblem:
     if not isinstance(problem, PerformativeProblem):
         raise fail("problem", type(problem).__name__, "be a PerformativeProblem", "Build it first.")
     return problem
+
+
+def obstacles(problem: PerformativeProblem) -> list[str]:
+    """Why these matrices cannot be built; empty if they can."""
+    missing = []
+    if not isinstance(problem.cost, QuadraticCost):
+        missing.append("the cost is not quadratic: pass cost=pc.QuadraticCost(Q, R)")
+    policy = jax.ShapeDtypeStruct(problem.lifted_shape, problem.dtype)
+    if eqx.filter_eval_shape(lambda law, M: law.covariance(M, problem.horizon), problem.perturbation, policy) is None:
+        family = type(problem.perturbation).__name__
+        wanted = "perturbation=pc.DirectionalPerturbation(directions, scale)"
+        missing.append(f"{family} does not know its mean and covariance: pass a family that does, such as {wanted}")
+    if (size := math.prod(problem.policy_shape)) > DENSE_LIMIT:
+        missing.append(
+            f"{size} free parameters are more than {DENSE_LIMIT}: pass a shorter memory, memory=1, or a structure such "
+            "as structure=pc.RepeatedBlock(2)"
+        )
+    return missing
 
 
 @eqx.filter_jit

@@ -8,6 +8,8 @@ Two fixed-point arguments (docs: theory, section on existence), neither of which
   least-squares problem whose non-negative weights alone depend on M', and such minimisers stay in one bounded set.
 """
 
+from typing import NamedTuple
+
 import jax
 import numpy as np
 
@@ -15,6 +17,13 @@ from perfcontrol.costs import QuadraticCost
 from perfcontrol.perturbations import DirectionalPerturbation, NoPerturbation
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.theory.derivatives import hessian_without_reaction, tangent_basis
+
+
+class Existence(NamedTuple):
+    """Whether a stable policy exists: True, False or None (unknown), and why."""
+
+    exists: bool | None
+    reason: str
 
 
 def set_radius(problem: PerformativeProblem) -> float | None:
@@ -30,18 +39,21 @@ def reaction_is_continuous(problem: PerformativeProblem) -> bool:
     return problem.sensitivity() is not None or isinstance(problem.perturbation, DirectionalPerturbation)
 
 
-def existence(problem: PerformativeProblem) -> tuple[bool | None, str]:
+def existence(problem: PerformativeProblem) -> Existence:
     """True with the argument that proves it, or None with the reason why neither argument applies."""
     if set_radius(problem) is not None and reaction_is_continuous(problem):
-        return True, "the feasible set is compact and convex and the reaction continuous (Kakutani's theorem)"
+        return Existence(
+            True, "the feasible set is compact and convex and the reaction continuous (Kakutani's theorem)"
+        )
     if bounded_response(problem):
-        return True, (
+        return Existence(
+            True,
             "best responses are minimisers of least-squares problems whose non-negative weights alone depend on the "
-            "deployed policy, so they stay in a bounded set (Brouwer's theorem)"
+            "deployed policy, so they stay in a bounded set (Brouwer's theorem)",
         )
     if set_radius(problem) is None:
-        return None, "the feasible set is unbounded, and no other argument applies"
-    return None, "the reaction is not known to be continuous"
+        return Existence(None, "the feasible set is unbounded, and no other argument applies")
+    return Existence(None, "the reaction is not known to be continuous")
 
 
 def bounded_response(problem: PerformativeProblem) -> bool:

@@ -13,6 +13,7 @@ from perfcontrol.theory.certificates.ingredients import gather
 from perfcontrol.theory.derivatives import hessian
 from perfcontrol.theory.stability.sampled_jacobian import sample_gradients
 from tests.theory.problems import random_problem
+from tests.tools import assert_refused
 
 SLACK = 1 + 1e-7
 responses = jax.jit(jax.vmap(pc.best_response, in_axes=(None, 0)))
@@ -232,3 +233,54 @@ def test_weights_fall_in_time_and_contributions_add_up():
     np.testing.assert_allclose(certificate.contributions, items.sensitivity * certificate.weights)
     assert certificate.lhs == pytest.approx(certificate.contributions.sum())
     assert certificate.margin == pytest.approx(certificate.rhs - certificate.lhs)
+
+
+def test_declared_values_of_the_wrong_sign_or_shape_are_refused_at_construction():
+    assert_refused(lambda: pc.Rigorous(noise_bound=-1.0), "noise_bound", "-1")
+    assert_refused(lambda: pc.Paper(sensitivity=[0.1, -0.1]), "sensitivity", "-0.1 at t = 1")
+    assert_refused(lambda: pc.Rigorous(smoothness=np.ones((2, 2))), "smoothness", "(2, 2)", "T+1")
+    assert_refused(lambda: pc.Sharp(batch=0), "batch", "at least 1")
+    problem = random_problem(0)
+    assert_refused(lambda: pc.certify(problem, pc.Rigorous(smoothness=np.ones(5))), "smoothness", "(T+1,) = (6,)")
+    assert_refused(lambda: pc.certify(problem, pc.GlobalBound(scale_range=(0.0, 1.0))), "scale_range", "three")
+    wrong = pc.GlobalBound(scale_range=(np.zeros(3), 1.0, 0.5))
+    assert_refused(lambda: pc.certify(problem, wrong), "scale_range", "(5, 2)")
+    assert_refused(lambda: pc.certify(problem, pc.Sharp(M=np.zeros((1, 1, 2)))), "M", "(2, 1, 2)")
+
+
+def with_scale(scale, **others):
+    base = random_problem(1)
+    directions = base.perturbation.directions
+    fields = {"system": base.system, "horizon": 5, "memory": 2, "gain": base.gain, "noise": base.noise}
+    fields |= {"cost": base.cost, "feasible_set": base.feasible_set}
+    return pc.PerformativeProblem(**fields | others, perturbation=pc.DirectionalPerturbation(directions, scale))
+
+
+@pytest.mark.parametrize(
+    ("kind", "problem", "argument"),
+    [
+        ("rigorous", lambda: with_scale(lambda M: 0.1 * jnp.ones(2)), "sensitivity=0.1"),
+        ("rigorous", lambda: with_scale(lambda M: 0.1 * jnp.ones(2)), "perturbation_bound=0.5"),
+        ("rigorous", lambda: with_scale(np.ones(2), noise=pc.Gaussian(np.zeros(2), np.eye(2))), "noise_bound=2.0"),
+        ("global", lambda: with_scale(lambda M: 0.1 * jnp.ones(2)), "scale_range=(0.0, 1.0, 0.5)"),
+        ("global", lambda: with_scale(lambda M: 0.1 * jnp.ones(2)), "pc.Affine(offset, slope)"),
+        (
+            "paper",
+            lambda: with_scale(np.ones(2), gain=0, system=pc.LinearSystem(2 * np.eye(2), np.ones((2, 1)))),
+            "gain=",
+        ),
+        (
+            "sharp",
+            lambda: with_scale(np.ones(2), cost=pc.ConvexCost(lambda t, x, u: jnp.sum(x**4))),
+            "pc.QuadraticCost",
+        ),
+    ],
+)
+def test_what_is_missing_names_the_argument_that_makes_the_certificate_applicable(kind, problem, argument):
+    assert any(argument in reason for reason in pc.certify(problem(), kind).missing)
+
+
+def test_example_values_that_are_named_make_the_certificates_applicable():
+    problem = with_scale(lambda M: 0.1 * jnp.ones(2))
+    assert pc.certify(problem, pc.Rigorous(sensitivity=0.1, perturbation_bound=0.5)).applicable
+    assert pc.certify(problem, pc.GlobalBound(scale_range=(0.0, 1.0, 0.5))).applicable

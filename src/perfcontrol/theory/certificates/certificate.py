@@ -7,19 +7,12 @@ import numpy as np
 
 from perfcontrol.theory.assumptions import Assumption
 
-KINDS = ("paper", "rigorous", "global", "sharp")
-TITLES = {
-    "paper": "The paper's sufficient condition, constants as printed",
-    "rigorous": "The sufficient condition with corrected constants",
-    "global": "The global contraction bound",
-    "sharp": "The local test at the stable policy",
-}
-
 
 @dataclass(frozen=True)
 class Certificate:
     """The verdict of one certificate on one problem.
 
+    kind: its name. verdict: one sentence.
     applicable: whether its assumptions can be met at all; if not, `missing` names what is lacking, and `holds`,
         `lhs`, `rhs`, `rate` are None. Not applicable never means "does not hold".
     holds: True where this certificate proves (sharp: finds) that the best response Φ contracts.
@@ -32,6 +25,7 @@ class Certificate:
     """
 
     kind: str
+    verdict: str
     applicable: bool
     missing: tuple[str, ...] = ()
     holds: bool | None = None
@@ -54,35 +48,11 @@ class Certificate:
         return self.rhs - self.lhs
 
     def __str__(self) -> str:
-        sentences = [self._verdict(), *self.notes, self._existence()]
+        sentences = [self.verdict, *self.notes, self._existence()]
         if self.assumptions:
             sentences.append("It rests on: " + "; ".join(str(item) for item in self.assumptions) + ".")
-        return " ".join(sentence for sentence in sentences if sentence)
-
-    def _verdict(self) -> str:
-        title = TITLES.get(self.kind, self.kind)
-        if not self.applicable:
-            return f"{title} is not applicable here, which says nothing against the problem: {'; '.join(self.missing)}."
-        numbers = f"{self.lhs:.4g} {'<' if self.holds else '>='} {self.rhs:.4g}"
-        if self.kind == "sharp":
-            if self.holds:
-                return (
-                    f"{title} finds that repeated minimisation converges locally: spectral radius {numbers}, so that "
-                    f"near the stable policy each round shrinks the error by about {self.rate:.4g}."
-                )
-            return f"{title} finds no local convergence of repeated minimisation: spectral radius {numbers}."
-        if self.holds:
-            return (
-                f"{title} holds ({numbers}): each round of repeated minimisation multiplies the distance to the stable "
-                f"policy by at most {self.rate:.4g}."
-            )
-        return f"{title} does not hold ({numbers}); it is sufficient, not necessary, so nothing follows from that."
+        return " ".join(sentences)
 
     def _existence(self) -> str:
         verdict = {True: "A stable policy exists", False: "No stable policy exists", None: "Existence is open"}
         return f"{verdict[self.exists]}: {self.existence}."
-
-
-def not_applicable(kind: str, missing: list[str], exists: bool | None, existence: str, **values: Any) -> Certificate:
-    """A certificate whose assumptions cannot be met, with the reasons."""
-    return Certificate(kind, False, tuple(missing), exists=exists, existence=existence, values=values)

@@ -1,46 +1,57 @@
-"""`pc.certify`: one entrance to the four certificates."""
+"""`pc.certify`: one entrance to every kind of certificate."""
 
-from collections.abc import Callable
 from typing import Any
 
-from perfcontrol._checks import fail
+from perfcontrol._checks import check_keywords, fail
 from perfcontrol.problem import PerformativeProblem
-from perfcontrol.theory.certificates.certificate import KINDS, Certificate
-from perfcontrol.theory.certificates.global_bound import certify_global
-from perfcontrol.theory.certificates.paper import certify_paper
-from perfcontrol.theory.certificates.rigorous import certify_rigorous
-from perfcontrol.theory.certificates.sharp import certify_sharp
+from perfcontrol.theory.certificates.certificate import Certificate
+from perfcontrol.theory.certificates.global_bound import GlobalBound
+from perfcontrol.theory.certificates.kind import AbstractCertificateKind
+from perfcontrol.theory.certificates.paper import Paper
+from perfcontrol.theory.certificates.rigorous import Rigorous
+from perfcontrol.theory.certificates.sharp import Sharp
 from perfcontrol.theory.derivatives import check_problem
 
-CERTIFIERS: dict[str, Callable[..., Certificate]] = {
-    "paper": certify_paper,
-    "rigorous": certify_rigorous,
-    "global": certify_global,
-    "sharp": certify_sharp,
+SHORTHANDS: dict[str, type[AbstractCertificateKind]] = {
+    kind.name: kind for kind in (Paper, Rigorous, GlobalBound, Sharp)
 }
+KINDS = tuple(SHORTHANDS)
 
 
-def certify(problem: PerformativeProblem, kind: str = "sharp", **options: Any) -> Certificate:
+def as_kind(kind: Any, settings: dict[str, Any] | None = None) -> AbstractCertificateKind:
+    """The kind itself, or the one that a name and its settings stand for."""
+    settings = settings or {}
+    if isinstance(kind, AbstractCertificateKind):
+        check_keywords(f"a call that is given pc.{type(kind).__name__}(...)", settings, ())
+        return kind
+    if isinstance(kind, type) and issubclass(kind, AbstractCertificateKind):
+        raise fail("kind", f"the class {kind.__name__}", "be an object", f"Add parentheses: pc.{kind.__name__}().")
+    if kind not in KINDS:
+        required = f"be one of {KINDS}, or an object such as pc.Sharp()"
+        raise fail("kind", repr(kind), required, "Pass one of these names.")
+    return SHORTHANDS[kind](**settings)
+
+
+def certify(
+    problem: PerformativeProblem, kind: str | AbstractCertificateKind = "sharp", **settings: Any
+) -> Certificate:
     """Does a stable policy exist, does repeated minimisation reach it, and how fast?
 
     Args:
         problem: the problem.
-        kind: "paper" (the published sufficient condition, constants as printed), "rigorous" (the same condition with
-            corrected constants), "global" (a proved contraction bound for quadratic costs and fixed directions) or
-            "sharp" (exact, but only local: at the stable policy itself).
-        options: of that kind: `declared` values for "paper" and "rigorous" (such as sensitivity=..., noise_bound=...,
-            strong_convexity=...) and estimate=True; scale_range for "global"; batch, samples, pairs, key for "sharp".
+        kind: `pc.Paper()` (the published sufficient condition, constants as printed), `pc.Rigorous()` (the same
+            condition with corrected constants), `pc.GlobalBound()` (a proved contraction bound for quadratic costs and
+            fixed directions) or `pc.Sharp()` (exact, but only local: at the stable policy itself). As a shorthand
+            "paper", "rigorous", "global" or "sharp".
+        settings: of the kind, where its shorthand is used: `pc.certify(problem, "rigorous", noise_bound=2.0)`.
 
     Returns:
         A `Certificate`; `str()` of it reads as a paragraph.
 
     Raises:
-        InputError: an unknown kind, or an option with a wrong value.
+        InputError: an unknown kind, or a setting of a wrong name or value.
 
     References:
         Lemma on existence and uniqueness (paper); docs: theory.
     """
-    check_problem(problem)
-    if kind not in CERTIFIERS:
-        raise fail("kind", repr(kind), f"be one of {KINDS}", "Pass one of these names.")
-    return CERTIFIERS[kind](problem, **options)
+    return as_kind(kind, settings).assess(check_problem(problem))

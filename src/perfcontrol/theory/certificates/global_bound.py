@@ -12,74 +12,71 @@ With Δ_t = Θ_t + Σ_k σ_{tk}(M') ζ_{tk} D_k and θ = σ², the cost in coord
 References: docs, theory, "The global certificate".
 """
 
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 import scipy.optimize
 
-from perfcontrol.costs import QuadraticCost
 from perfcontrol.perturbations import DirectionalPerturbation
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.theory.assumptions import Assumption
-from perfcontrol.theory.certificates.certificate import Certificate, not_applicable
+from perfcontrol.theory.certificates.certificate import Certificate
+from perfcontrol.theory.certificates.ingredients import FIXED_NOISE
+from perfcontrol.theory.certificates.kind import AbstractCertificateKind
 from perfcontrol.theory.certificates.quadratic_form import form_at, form_derivative, least_cost, simplified
-from perfcontrol.theory.certificates.scale_range import ScaleRange
-from perfcontrol.theory.certificates.scale_range import scale_range as _scale_range
-from perfcontrol.theory.derivatives import DENSE_LIMIT, tangent_basis
+from perfcontrol.theory.certificates.scale_range import ScaleRange, scale_range
+from perfcontrol.theory.derivatives import obstacles, tangent_basis
 from perfcontrol.theory.existence import constant_mean, existence
 
 
-def certify_global(problem: PerformativeProblem, *, scale_range: Any = None) -> Certificate:
+@dataclass(frozen=True, kw_only=True)
+class GlobalBound(AbstractCertificateKind):
     """A modulus of contraction of Φ in the norm N, for quadratic costs and perturbations along fixed directions.
 
     Args:
         scale_range: (low, high, Lipschitz constant) of the scales over the set, each broadcast to (T, k), for scales
-        that are a general function or a set on which they are not known to be bounded.
+            that are a general function or a set on which they are not known to be bounded.
+
+    Raises:
+        InputError: (in `pc.certify`) a range that is not in order, or of a wrong shape.
 
     References:
         docs: theory, "The global certificate".
     """
-    exists, reason = existence(problem)
-    missing = []
-    if not isinstance(problem.cost, QuadraticCost):
-        missing.append("the cost is not quadratic")
-    if not isinstance(problem.perturbation, DirectionalPerturbation):
-        missing.append("the perturbations are not of fixed directions (pc.DirectionalPerturbation)")
-    elif not constant_mean(problem):
-        missing.append("the mean of the perturbations depends on the policy")
-    if problem.noise_reacts:
-        missing.append("the noise reacts to the policy")
-    if int(np.prod(problem.policy_shape)) > DENSE_LIMIT:
-        missing.append(f"more than {DENSE_LIMIT} free parameters")
-    ranges = None
-    if not missing:
-        ranges = _scale_range(problem, scale_range)
+
+    scale_range: tuple[Any, Any, Any] | None = None
+
+    name: ClassVar[str] = "global"
+    title: ClassVar[str] = "The global contraction bound"
+
+    def assess(self, problem: PerformativeProblem) -> Certificate:
+        exists, missing = existence(problem), _missing(problem)
+        ranges = None if missing else scale_range(problem, self.scale_range)
         if isinstance(ranges, str):
             missing.append(ranges)
-    if missing or ranges is None or isinstance(ranges, str):
-        return not_applicable("global", missing, exists, reason)
-    assumptions = (
-        Assumption("the modulus of contraction", "proved"),
-        *([Assumption("the range of the scales", "declared")] if scale_range is not None else []),
-    )
-    modulus, values, note = _modulus(problem, ranges)
-    if exists is None and modulus < 1:
-        exists, reason = True, "Φ is a contraction of a closed set"
-    return Certificate(
-        "global",
-        True,
-        holds=modulus < 1,
-        exists=exists,
-        existence=reason,
-        lhs=modulus,
-        rhs=1.0,
-        rate=modulus,
-        assumptions=assumptions,
-        values=values,
-        notes=(note,) if note else (),
-    )
+        if not isinstance(ranges, ScaleRange):
+            return self.refuse(missing, exists)
+        assumptions = [Assumption("the modulus of contraction", "proved")]
+        if self.scale_range is not None:
+            assumptions.append(Assumption("the range of the scales", "declared"))
+        modulus, values, note = _modulus(problem, ranges)
+        notes = (note,) if note else ()
+        return self.conclude(modulus, 1.0, exists, assumptions=tuple(assumptions), values=values, notes=notes)
+
+
+def _missing(problem: PerformativeProblem) -> list[str]:
+    missing = obstacles(problem)
+    if not isinstance(problem.perturbation, DirectionalPerturbation):
+        wanted = "perturbation=pc.DirectionalPerturbation(directions, pc.Affine(offset, slope))"
+        missing.append(f"the perturbations are not of fixed directions: pass {wanted}, or use pc.Sharp()")
+    elif not constant_mean(problem):
+        missing.append("the mean of the perturbations depends on the policy: pass mean=None, or use pc.Sharp()")
+    if problem.noise_reacts:
+        missing.append(FIXED_NOISE)
+    return missing
 
 
 def _modulus(problem: PerformativeProblem, ranges: ScaleRange) -> tuple[float, dict[str, Any], str]:

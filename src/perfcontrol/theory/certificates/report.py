@@ -5,8 +5,10 @@ from typing import Any
 import numpy as np
 
 from perfcontrol.problem import PerformativeProblem
-from perfcontrol.theory.certificates.certificate import KINDS, Certificate
-from perfcontrol.theory.certificates.certify import certify
+from perfcontrol.theory.certificates.certificate import Certificate
+from perfcontrol.theory.certificates.certify import KINDS, certify
+from perfcontrol.theory.certificates.kind import AbstractCertificateKind
+from perfcontrol.theory.certificates.sharp import Sharp
 
 PLAIN_VALUES = (
     "kappa",
@@ -51,16 +53,20 @@ def certificate_row(certificate: Certificate) -> dict[str, Any]:
 
 
 def verdict_rows(
-    problem: PerformativeProblem, kinds: tuple[str, ...] = KINDS, *, batch: int = 1, key: Any = None
+    problem: PerformativeProblem,
+    kinds: tuple[str | AbstractCertificateKind, ...] = KINDS,
+    *,
+    batch: int = 1,
+    key: Any = None,
 ) -> list[dict[str, Any]]:
     """Every certificate of a problem as plain data, one dict a kind.
 
     Args:
-        kinds: which ones. batch, key: of the sharp one.
+        kinds: which ones, by name or as objects. batch, key: of the sharp one where it is given by name.
 
     Returns:
         Dicts with "kind", "applicable", "missing", "holds", "exists", "existence", "lhs", "rhs", "margin", "rate",
         "weights", "contributions", "assumptions", "values" and "text".
     """
-    options: dict[str, dict[str, Any]] = {"sharp": {"batch": batch, "key": key}}
-    return [certificate_row(certify(problem, kind, **options.get(kind, {}))) for kind in kinds]
+    sharp = Sharp(batch=batch, key=key)
+    return [certificate_row(certify(problem, sharp if kind == sharp.name else kind)) for kind in kinds]

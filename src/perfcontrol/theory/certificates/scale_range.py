@@ -9,6 +9,13 @@ from perfcontrol._checks import as_array, fail
 from perfcontrol.perturbations import DirectionalPerturbation
 from perfcontrol.problem import PerformativeProblem
 
+DECLARE = "declare (low, high, Lipschitz constant) over the set by scale_range=(0.0, 1.0, 0.5)"
+GENERAL = f"the scales are a general function: pass scale=pc.Affine(offset, slope) if they are affine, or {DECLARE}"
+UNBOUNDED = (
+    "the scales are not known to be bounded on this feasible set: pass a bounded one, such as "
+    f"feasible_set=pc.FrobeniusBall(1.0), or {DECLARE}"
+)
+
 
 class ScaleRange(NamedTuple):
     """σ_{tk} ∈ [low, high] over the set, (T, k); slopes: (T, k, p) in the free parameters where affine, else None;
@@ -25,26 +32,30 @@ def scale_range(problem: PerformativeProblem, declared: Any = None) -> ScaleRang
     law = problem.perturbation
     assert isinstance(law, DirectionalPerturbation)
     shape = (problem.horizon, law.directions.shape[0])
-    size = int(np.prod(problem.policy_shape))
 
     def full(value: Any) -> np.ndarray:
-        return np.broadcast_to(np.asarray(value, dtype=float), shape)
+        try:
+            return np.broadcast_to(np.asarray(value, dtype=float), shape)
+        except ValueError:
+            required = f"hold numbers, or arrays that broadcast to (T, k) = {shape}"
+            raise fail("scale_range", f"shape {np.shape(value)}", required, "Time comes first.") from None
 
     if declared is not None:
+        if not isinstance(declared, tuple | list) or len(declared) != 3:
+            required = "be three: (low, high, Lipschitz constant)"
+            raise fail("scale_range", repr(declared), required, "For example scale_range=(0.0, 1.0, 0.5).")
         low, high, lipschitz = (full(as_array("scale_range", part)) for part in declared)
         if np.any(low > high) or np.any(lipschitz < 0):
             raise fail("scale_range", "low > high or a negative Lipschitz constant", "be ordered", "Check the order.")
         return ScaleRange(low, high, None, lipschitz)
     bounds, lipschitz = law.scale.range(problem.lifted_set), law.scale.lipschitz(problem.lifted_set)
     if bounds is None or lipschitz is None:
-        if not law.scale.continuous:
-            return "the scales are a general function: declare scale_range=(low, high, Lipschitz constant)"
-        return "the scales are not known to be bounded on this feasible set: declare scale_range, or bound the set"
+        return UNBOUNDED if law.scale.continuous else GENERAL
     low, high = full(bounds[0]), full(bounds[1])
     derivative = law.scale.derivative()
     if derivative is None:
         return ScaleRange(low, high, None, full(lipschitz) * problem.structure.norm)
     slopes = jax.vmap(problem.structure.adjoint)(derivative.reshape(-1, *problem.lifted_shape))
-    slopes = np.asarray(slopes, dtype=float).reshape(*derivative.shape[:-3], size)
-    slopes = np.broadcast_to(slopes, (*shape, size))
+    slopes = np.asarray(slopes, dtype=float).reshape(*derivative.shape[:-3], -1)
+    slopes = np.broadcast_to(slopes, (*shape, slopes.shape[-1]))
     return ScaleRange(low, high, slopes, np.linalg.norm(slopes, axis=-1))

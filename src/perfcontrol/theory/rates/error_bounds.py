@@ -18,20 +18,30 @@ from perfcontrol._checks import check_integer, fail
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.solvers import InverseStep
 from perfcontrol.solvers.step_sizes import as_step_size
-from perfcontrol.theory.certificates.certify import certify
+from perfcontrol.theory.certificates.certify import as_kind
+from perfcontrol.theory.certificates.kind import AbstractCertificateKind
 from perfcontrol.theory.derivatives import check_problem
 from perfcontrol.theory.rates.step_size import descent_constants
 
 
 def rrm_error_bound(
-    problem: PerformativeProblem, initial_error: float, steps: int, *, kind: str = "rigorous", **options: Any
+    problem: PerformativeProblem,
+    initial_error: float,
+    steps: int,
+    *,
+    kind: str | AbstractCertificateKind = "rigorous",
+    **settings: Any,
 ) -> np.ndarray:
     """‖M_n - M^PS‖_F ≤ rateⁿ ‖M_0 - M^PS‖_F for n = 0..steps, (steps+1,).
 
-    For `kind="global"` the contraction is in the norm N; the bound then carries √cond of it once.
+    For the global kind the contraction is in the norm N; the bound then carries √cond of it once.
 
     Args:
-        initial_error: ‖M_0 - M^PS‖_F, or a bound of it such as the diameter of the set. steps: N.
+        problem: the problem.
+        initial_error: ‖M_0 - M^PS‖_F, or a bound of it such as the diameter of the set.
+        steps: N.
+        kind: `pc.Rigorous(...)`, `pc.Paper(...)` or `pc.GlobalBound(...)`, or its name.
+        settings: of the kind where it is given by name.
 
     Raises:
         InputError: the certificate is not applicable or does not hold.
@@ -41,14 +51,15 @@ def rrm_error_bound(
     """
     steps = check_integer("steps", steps, 0)
     initial_error = _error("initial_error", initial_error)
-    if kind not in ("rigorous", "paper", "global"):
+    chosen = as_kind(kind, settings)
+    if chosen.name not in ("rigorous", "paper", "global"):
         raise fail("kind", repr(kind), "be 'rigorous', 'paper' or 'global'", "The sharp test is local: no bound.")
-    certificate = certify(check_problem(problem), kind, **options)
+    certificate = chosen.assess(check_problem(problem))
     if not certificate.holds:
-        raise fail("problem", str(certificate), f"satisfy the {kind} certificate", "No contraction is proved.")
+        raise fail("problem", str(certificate), f"satisfy the {chosen.name} certificate", "No contraction is proved.")
     assert certificate.rate is not None
     factor = 1.0
-    if kind == "global" and "metric" in certificate.values:
+    if chosen.name == "global" and "metric" in certificate.values:
         values = np.linalg.eigvalsh(certificate.values["metric"])
         factor = math.sqrt(values[-1] / values[0])
     curve = factor * initial_error * certificate.rate ** np.arange(steps + 1.0)
@@ -63,17 +74,23 @@ def rsgd_error_bound(
     steps: int,
     *,
     batch: int = 1,
-    kind: str = "rigorous",
+    kind: str | AbstractCertificateKind = "rigorous",
     form: str = "recursion",
     **declared: Any,
 ) -> np.ndarray:
     """A bound of E ‖M_n - M^PS‖²_F along RSGD for n = 0..steps, (steps+1,).
 
     Args:
-        step_size: as `pc.RSGD` takes it. initial_error: E ‖M_0 - M^PS‖²_F. batch: paths a step.
-        kind: whose constants: "rigorous" or "paper". form: "recursion" (any step sizes; the sharpest), "closed" (the
-        product and 2η_{N-1}V/m; step sizes as in the general-step lemma) or "printed" (Theorem 1 as printed, with
-        e^{-Σ_{n=1}^N φ₁m/n} in place of the product, which can be too small, and 4 in place of 2).
+        problem: the problem.
+        step_size: as `pc.RSGD` takes it.
+        initial_error: E ‖M_0 - M^PS‖²_F.
+        steps: N.
+        batch: paths a step.
+        kind: whose constants: `pc.Rigorous(...)` or `pc.Paper(...)`, or its name.
+        form: "recursion" (any step sizes; the sharpest), "closed" (the product and 2η_{N-1}V/m; step sizes as in the
+            general-step lemma) or "printed" (Theorem 1 as printed, with e^{-Σ_{n=1}^N φ₁m/n} in place of the product,
+            which can be too small, and 4 in place of 2).
+        declared: settings of the kind where it is given by name.
 
     Raises:
         InputError: no step is proved to work, or the step sizes break the conditions of the form asked for.

@@ -13,6 +13,7 @@ import numpy as np
 from perfcontrol._checks import fail
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.theory.certificates.certify import certify
+from perfcontrol.theory.certificates.kind import AbstractCertificateKind
 from perfcontrol.theory.stability.strong_stability import check_per_step
 
 
@@ -44,7 +45,7 @@ def compare_orders(
     build: Callable[[np.ndarray], PerformativeProblem],
     epsilon: Any,
     *,
-    kind: str = "sharp",
+    kind: str | AbstractCertificateKind = "sharp",
     orders: Iterable[Any] | None = None,
     seed: int = 0,
     **options: Any,
@@ -52,9 +53,13 @@ def compare_orders(
     """The rate of one certificate for several orders of the same sensitivities, smallest rate first.
 
     Args:
-        build: sensitivities (T,) -> the problem that has them. epsilon: (T,), in any order. kind: of certificate;
-        "sharp" is the exact evaluation. orders: permutations of 0..T-1, positions in the sorted list; None: all of
-        them up to T = 5, else ascending, descending and ten random ones. options: of `pc.certify`.
+        build: sensitivities (T,) -> the problem that has them.
+        epsilon: (T,), in any order.
+        kind: of certificate, by name or as an object; "sharp" is the exact evaluation, here without its samples.
+        orders: permutations of 0..T-1, positions in the sorted list; None: all of them up to T = 5, else ascending,
+            descending and `seed`'s ten random ones.
+        seed: of these.
+        options: of the kind where it is given by name.
 
     Returns:
         One dict an order: "order" (T,), "epsilon" (T,), "rate" and "holds" (None where not applicable).

@@ -6,7 +6,8 @@ from typing import Any, NamedTuple
 from perfcontrol._checks import fail
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.theory.certificates.certificate import Certificate
-from perfcontrol.theory.certificates.certify import certify
+from perfcontrol.theory.certificates.certify import as_kind
+from perfcontrol.theory.certificates.kind import AbstractCertificateKind
 from perfcontrol.theory.derivatives import check_problem
 
 
@@ -26,21 +27,27 @@ class DescentConstants(NamedTuple):
     certificate: Certificate
 
 
-def descent_constants(problem: PerformativeProblem, kind: str = "rigorous", **declared: Any) -> DescentConstants:
+def descent_constants(
+    problem: PerformativeProblem, kind: str | AbstractCertificateKind = "rigorous", **declared: Any
+) -> DescentConstants:
     """m, L and V of a problem.
+
+    Args:
+        kind: "rigorous" or "paper", or the object. declared: its settings where it is given by name.
 
     Raises:
         InputError: the certificate is not applicable, or S ≥ μ̃, so that no step size is proved to work.
     """
     check_problem(problem)
-    if kind not in ("rigorous", "paper"):
+    chosen = as_kind(kind, declared)
+    if chosen.name not in ("rigorous", "paper"):
         raise fail("kind", repr(kind), "be 'rigorous' or 'paper'", "Only these two come with gradient bounds.")
-    certificate = certify(problem, kind, **declared)
+    certificate = chosen.assess(problem)
     if not certificate.applicable:
         raise fail(
             "problem",
             f"a certificate that is not applicable: {'; '.join(certificate.missing)}",
-            f"admit the {kind} certificate",
+            f"admit the {chosen.name} certificate",
             "Declare what is missing, or use pc.safe_step.",
         )
     assert certificate.lhs is not None and certificate.rhs is not None
@@ -57,14 +64,17 @@ def descent_constants(problem: PerformativeProblem, kind: str = "rigorous", **de
     )
 
 
-def theorem_step_size(problem: PerformativeProblem, *, kind: str = "rigorous", **declared: Any) -> TheoremStepSize:
+def theorem_step_size(
+    problem: PerformativeProblem, *, kind: str | AbstractCertificateKind = "rigorous", **declared: Any
+) -> TheoremStepSize:
     """φ₁ and φ₂ of the diminishing step η_n = φ₁/(n + φ₂) with the largest first step that the theorem allows.
 
     φ₁/φ₂ = c with c = min(m/L², 1/m) (as printed: m/(2L²) in place of m/L²), and φ₂ ≥ 1 the smallest for which
     φ₁/(1 + 1/φ₂) ≥ 2/m.
 
     Args:
-        kind: "rigorous", or "paper" for the printed constants. declared: values for the certificate.
+        kind: `pc.Rigorous(...)`, or `pc.Paper(...)` for the printed constants; or its name.
+        declared: settings of the kind where it is given by name.
 
     Raises:
         InputError: no such step exists, with the reason.
@@ -72,8 +82,8 @@ def theorem_step_size(problem: PerformativeProblem, *, kind: str = "rigorous", *
     References:
         Theorem 1, conditions (17) and (18).
     """
-    m, L, _, _ = descent_constants(problem, kind, **declared)
-    first = min(m / L**2 / (2 if kind == "paper" else 1), 1 / m)
+    m, L, _, certificate = descent_constants(problem, kind, **declared)
+    first = min(m / L**2 / (2 if certificate.kind == "paper" else 1), 1 / m)
     ratio = 2 / (m * first)
     phi2 = max(1.0, (ratio + math.sqrt(ratio**2 + 4 * ratio)) / 2)
     return TheoremStepSize(first * phi2, phi2)

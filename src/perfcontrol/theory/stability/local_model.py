@@ -12,12 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Array
 
-from perfcontrol._checks import InputError
-from perfcontrol.evaluate.cost_to_go import require_moments
 from perfcontrol.evaluate.exact import expected_gradient
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.theory.derivatives import (
-    DENSE_LIMIT,
     hessian,
     projection_derivative,
     range_basis,
@@ -38,18 +35,6 @@ class LocalModel(NamedTuple):
     drift: np.ndarray
     basis: np.ndarray
     damping: Callable[[float], np.ndarray] | None
-
-
-def obstacles(problem: PerformativeProblem) -> list[str]:
-    """Why the exact local analysis cannot be made; empty if it can."""
-    missing = []
-    try:
-        require_moments(problem)
-    except InputError as error:
-        missing.append(str(error))
-    if int(np.prod(problem.policy_shape)) > DENSE_LIMIT:
-        missing.append(f"more than {DENSE_LIMIT} free parameters")
-    return missing
 
 
 def local_model(problem: PerformativeProblem, M: Array) -> LocalModel:
