@@ -6,7 +6,7 @@ import pytest
 import scipy.optimize
 
 import perfcontrol as pc
-from perfcontrol.sets import intersection
+from perfcontrol.sets.intersection.projection import solve
 from tests.contracts.feasible_set import SetContract
 from tests.tools import assert_close, assert_refused, normal, tolerance
 
@@ -99,7 +99,7 @@ def test_dykstra_alone_matches_the_one_threshold_of_each_row():
                 lambda t, row=row: np.clip(row - t, -0.1, 0.4).sum() - 0.5, row.min() - 1, row.max() + 1, xtol=1e-15
             )
             expected[index] = np.clip(row - threshold, -0.1, 0.4)
-        alone = intersection._solve(feasible_set.sets, jnp.asarray(M), newton=False)
+        alone = solve(feasible_set.sets, jnp.asarray(M), newton=False)
         assert_close(alone.x.reshape(M.shape), expected, 1e-8)
         assert_close(feasible_set.project(jnp.asarray(M)), expected, 1e-12)
 

@@ -1,6 +1,5 @@
-"""Linear structures: free parameters -> the full policy (memory, input, state)."""
+"""The same block for each of several subsystems."""
 
-import abc
 import math
 
 import equinox as eqx
@@ -8,44 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from perfcontrol._checks import check_integer, fail
-
-
-class AbstractStructure(eqx.Module):
-    """An injective linear map 𝓛 from free parameters to policies, with 𝓛ᵀ𝓛 = norm² I."""
-
-    @abc.abstractmethod
-    def lift(self, parameters: Array) -> Array:
-        """𝓛 applied to free parameters."""
-
-    @abc.abstractmethod
-    def adjoint(self, M: Array) -> Array:
-        """𝓛ᵀ applied to a policy: turns gradients by M into gradients by the free parameters."""
-
-    @abc.abstractmethod
-    def free_shape(self, policy_shape: tuple[int, int, int]) -> tuple[int, int, int]:
-        """Shape of the free parameters of policies of that shape."""
-
-    @property
-    @abc.abstractmethod
-    def norm(self) -> float:
-        """‖𝓛‖."""
-
-
-class FullStructure(AbstractStructure):
-    """Every entry of the policy is free."""
-
-    def lift(self, parameters: Array) -> Array:
-        return parameters
-
-    def adjoint(self, M: Array) -> Array:
-        return M
-
-    def free_shape(self, policy_shape: tuple[int, int, int]) -> tuple[int, int, int]:
-        return policy_shape
-
-    @property
-    def norm(self) -> float:
-        return 1.0
+from perfcontrol.sets.structures.base import AbstractStructure
 
 
 class RepeatedBlock(AbstractStructure):
