@@ -10,20 +10,23 @@ Two fixed-point arguments (docs: theory, section on existence), neither of which
 
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import numpy as np
 
 from perfcontrol.costs import QuadraticCost
-from perfcontrol.perturbations import DirectionalPerturbation, NoPerturbation
+from perfcontrol.perturbations import DirectionalPerturbation, NoPerturbation, SampledPerturbation, StockPerturbation
 from perfcontrol.problem import PerformativeProblem
+from perfcontrol.theory.assumptions import Assumption, Status, reaction_status, word_of
 from perfcontrol.theory.derivatives import hessian_without_reaction, tangent_basis
 
 
 class Existence(NamedTuple):
-    """Whether a stable policy exists: True, False or None (unknown), and why."""
+    """Whether a stable policy exists: True, False or None (unknown), why, and what that rests on."""
 
     exists: bool | None
     reason: str
+    assumptions: tuple[Assumption, ...] = ()
 
 
 def set_radius(problem: PerformativeProblem) -> float | None:
@@ -33,27 +36,40 @@ def set_radius(problem: PerformativeProblem) -> float | None:
 
 
 def reaction_is_continuous(problem: PerformativeProblem) -> bool:
-    """Whether M ↦ D_t(M) is known to be continuous: a finite sensitivity, or a smooth family of this package."""
+    """Whether M ↦ D_t(M) is continuous, by proof or by the user's word: `reaction_status` tells which."""
+    law = problem.perturbation
     if problem.noise_reacts:
         return False
-    return problem.sensitivity() is not None or isinstance(problem.perturbation, DirectionalPerturbation)
+    if problem.sensitivity() is not None:
+        return True
+    return not isinstance(law, SampledPerturbation) and type(law).__module__.startswith("perfcontrol.")
 
 
 def existence(problem: PerformativeProblem) -> Existence:
-    """True with the argument that proves it, or None with the reason why neither argument applies."""
-    if set_radius(problem) is not None and reaction_is_continuous(problem):
+    """True with the argument that gives it, or None with the reason why neither argument applies."""
+    continuous = Assumption("the reaction is continuous in the deployed policy", reaction_status(problem.perturbation))
+    radius = set_radius(problem)
+    if radius is not None and reaction_is_continuous(problem):
+        convex = Assumption("the stage cost is continuous and convex", _cost_status(problem))
         return Existence(
-            True, "the feasible set is compact and convex and the reaction continuous (Kakutani's theorem)"
+            True,
+            "the feasible set is compact and convex and the reaction continuous (Kakutani's theorem)",
+            (continuous, convex, *word_of(problem)),
         )
     if bounded_response(problem):
         return Existence(
             True,
             "best responses are minimisers of least-squares problems whose non-negative weights alone depend on the "
             "deployed policy, so they stay in a bounded set (Brouwer's theorem)",
+            (continuous, *word_of(problem)),
         )
-    if set_radius(problem) is None:
+    if radius is None:
         return Existence(None, "the feasible set is unbounded, and no other argument applies")
     return Existence(None, "the reaction is not known to be continuous")
+
+
+def _cost_status(problem: PerformativeProblem) -> Status:
+    return "proved" if isinstance(problem.cost, QuadraticCost) else "declared"
 
 
 def bounded_response(problem: PerformativeProblem) -> bool:
@@ -79,11 +95,11 @@ def constant_mean(problem: PerformativeProblem) -> bool:
     law = problem.perturbation
     if law.policy_free_mean():
         return True
-    if getattr(problem.perturbation, "portfolio", None) is not None:  # the stock market: the mean follows row sums
-        return problem.feasible_set.row_total is not None
+    if isinstance(law, StockPerturbation):  # its mean follows the row sums of the portfolio
+        return law.fixes_rows(problem.lifted_set)
     mean_map = getattr(law, "mean_map", None)
     derivative = None if mean_map is None else mean_map.derivative()
-    if derivative is None:
+    if derivative is None or not eqx.tree_at(lambda law: law.mean_map, law, None).policy_free_mean():
         return False
     slopes = derivative.reshape(-1, *problem.lifted_shape)
     free = np.asarray(jax.vmap(problem.structure.adjoint)(slopes)).reshape(slopes.shape[0], -1)

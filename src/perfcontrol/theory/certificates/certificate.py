@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from perfcontrol.theory.assumptions import Assumption
+from perfcontrol.theory.assumptions import Assumption, Status
 
 
 @dataclass(frozen=True)
@@ -16,7 +16,8 @@ class Certificate:
     applicable: whether its assumptions can be met at all; if not, `missing` names what is lacking, and `holds`,
         `lhs`, `rhs`, `rate` are None. Not applicable never means "does not hold".
     holds: True where this certificate proves (sharp: finds) that the best response Φ contracts.
-    exists: whether a performatively stable policy exists: True, False or None (unknown); `existence` says why.
+    exists: whether a performatively stable policy exists: True, False or None (unknown); `existence` says why, and
+        `existence_status` how it is known: "proved", "declared" (it rests on the user's word) or "estimated".
     lhs, rhs: the two sides; it holds where lhs < rhs. margin: rhs - lhs.
     rate: its bound of the contraction rate of Φ (sharp: the local rate itself).
     weights: (T,), what one unit of ε_t adds to lhs: the propagation and aggregation of sensitivities; None for
@@ -31,6 +32,7 @@ class Certificate:
     holds: bool | None = None
     exists: bool | None = None
     existence: str = "nothing is known about existence"
+    existence_status: Status | None = None
     lhs: float | None = None
     rhs: float | None = None
     rate: float | None = None
@@ -55,4 +57,6 @@ class Certificate:
 
     def _existence(self) -> str:
         verdict = {True: "A stable policy exists", False: "No stable policy exists", None: "Existence is open"}
-        return f"{verdict[self.exists]}: {self.existence}."
+        if self.exists is None:
+            return f"{verdict[None]}: {self.existence}."
+        return f"{verdict[self.exists]} ({self.existence_status}): {self.existence}."

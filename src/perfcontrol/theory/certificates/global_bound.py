@@ -22,7 +22,7 @@ import scipy.optimize
 
 from perfcontrol.perturbations import DirectionalPerturbation
 from perfcontrol.problem import PerformativeProblem
-from perfcontrol.theory.assumptions import Assumption
+from perfcontrol.theory.assumptions import Assumption, word_of
 from perfcontrol.theory.certificates.certificate import Certificate
 from perfcontrol.theory.certificates.ingredients import FIXED_NOISE
 from perfcontrol.theory.certificates.kind import AbstractCertificateKind
@@ -59,12 +59,12 @@ class GlobalBound(AbstractCertificateKind):
             missing.append(ranges)
         if not isinstance(ranges, ScaleRange):
             return self.refuse(missing, exists)
-        assumptions = [Assumption("the modulus of contraction", "proved")]
+        assumptions = [Assumption("the modulus of contraction", "proved"), *word_of(problem)]
         if self.scale_range is not None:
             assumptions.append(Assumption("the range of the scales", "declared"))
         modulus, values, note = _modulus(problem, ranges)
         notes = (note,) if note else ()
-        return self.conclude(modulus, 1.0, exists, assumptions=tuple(assumptions), values=values, notes=notes)
+        return self.conclude(modulus, 1.0, exists, tuple(assumptions), values=values, notes=notes)
 
 
 def _missing(problem: PerformativeProblem) -> list[str]:

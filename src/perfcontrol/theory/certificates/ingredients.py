@@ -6,10 +6,11 @@ from typing import Any
 import numpy as np
 
 from perfcontrol._linalg import along_time
+from perfcontrol.perturbations import SampledPerturbation
 from perfcontrol.problem import PerformativeProblem
-from perfcontrol.theory.assumptions import Assumption
+from perfcontrol.theory.assumptions import Assumption, word_of
 from perfcontrol.theory.certificates.cost_constants import cost_constants, spectral_norms
-from perfcontrol.theory.certificates.declarations import Declarations
+from perfcontrol.theory.certificates.declarations import SERIES, Declarations
 from perfcontrol.theory.derivatives import fixed_noise
 from perfcontrol.theory.stability.strong_stability import check_per_step
 
@@ -71,7 +72,7 @@ def gather(problem: PerformativeProblem, declared: Declarations | None = None) -
         if own is None:
             missing.append(f"{what} is not known: pass {declared.examples[name]}, or {remedy}")
             return np.nan
-        if name == "sensitivity" and declared_by_family(problem):
+        if name in SERIES and isinstance(problem.perturbation, SampledPerturbation):
             assumptions.append(Assumption(what, "declared"))
         return own
 
@@ -133,7 +134,7 @@ def gather(problem: PerformativeProblem, declared: Declarations | None = None) -
         noise_mean=float(np.max(np.linalg.norm(np.asarray(along_time(noise.mean, 1, T)), axis=-1))),
         structure_norm=problem.structure.norm,
         missing=(*missing, *cost_missing),
-        assumptions=(*assumptions, *cost_assumptions),
+        assumptions=(*assumptions, *cost_assumptions, *word_of(problem)),
     )
 
 
@@ -144,8 +145,3 @@ def _quietest(covariances: np.ndarray) -> tuple[float, np.ndarray]:
     floor = float(values[quietest, 0])
     rounding = 1e-12 * max(float(values.max()), np.finfo(float).tiny)
     return 0.0 if floor <= rounding else floor, vectors[quietest, :, 0]
-
-
-def declared_by_family(problem: PerformativeProblem) -> bool:
-    """Whether the perturbation's sensitivity is the user's word (a sampled family) and not computed."""
-    return type(problem.perturbation).__name__ == "SampledPerturbation"

@@ -8,7 +8,7 @@ import numpy as np
 
 from perfcontrol._checks import check_keywords
 from perfcontrol.problem import PerformativeProblem
-from perfcontrol.theory.assumptions import Assumption
+from perfcontrol.theory.assumptions import Assumption, weakest
 from perfcontrol.theory.certificates.certificate import Certificate
 from perfcontrol.theory.existence import Existence
 
@@ -40,22 +40,22 @@ class AbstractCertificateKind(abc.ABC):
             )
         return f"{self.title} does not hold ({numbers}); it is sufficient, not necessary, so nothing follows from that."
 
-    def refuse(self, missing: list[str], existence: Existence) -> Certificate:
+    def refuse(self, missing: list[str], exists: Existence) -> Certificate:
         """The certificate of a problem that does not meet the assumptions, with what is missing."""
         reasons = "; ".join(missing)
         verdict = f"{self.title} is not applicable here, which says nothing against the problem: {reasons}."
         return Certificate(
-            self.name, verdict, False, tuple(missing), exists=existence.exists, existence=existence.reason
+            self.name, verdict, False, tuple(missing), assumptions=exists.assumptions, **_existence_fields(exists)
         )
 
     def conclude(
         self,
         lhs: float,
         rhs: float,
-        existence: Existence,
+        exists: Existence,
+        assumptions: tuple[Assumption, ...],
         *,
         contraction: bool = True,
-        assumptions: tuple[Assumption, ...] = (),
         weights: np.ndarray | None = None,
         contributions: np.ndarray | None = None,
         values: dict[str, Any] | None = None,
@@ -64,21 +64,25 @@ class AbstractCertificateKind(abc.ABC):
         """The certificate that holds where lhs < rhs; `contraction`: whether that proves Φ to contract the set."""
         holds = lhs < rhs
         rate = lhs / rhs if rhs > 0 else np.inf
-        if holds and contraction and existence.exists is None:
-            existence = Existence(True, "Φ is a contraction of a closed set")
+        if holds and contraction and exists.exists is None:
+            exists = Existence(True, "Φ is a contraction of a closed set", assumptions)
         return Certificate(
             self.name,
             self.sentence(holds, f"{lhs:.4g} {'<' if holds else '>='} {rhs:.4g}", rate),
             True,
             holds=holds,
-            exists=existence.exists,
-            existence=existence.reason,
             lhs=lhs,
             rhs=rhs,
             rate=rate,
             weights=weights,
             contributions=contributions,
-            assumptions=assumptions,
+            assumptions=tuple(dict.fromkeys((*assumptions, *exists.assumptions))),
             values=values or {},
             notes=notes,
+            **_existence_fields(exists),
         )
+
+
+def _existence_fields(exists: Existence) -> dict[str, Any]:
+    status = None if exists.exists is None else weakest(exists.assumptions)
+    return {"exists": exists.exists, "existence": exists.reason, "existence_status": status}

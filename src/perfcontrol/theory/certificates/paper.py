@@ -76,10 +76,10 @@ class Paper(Declarations, AbstractCertificateKind):
             float(contributions.sum()),
             mu,
             exists,
+            (constants_follow, *items.assumptions),
             contraction=self.repaired,
             weights=constants.weights,
             contributions=contributions,
-            assumptions=(constants_follow, *items.assumptions),
             values={
                 "kappa": stability.kappa,
                 "gamma": gamma,

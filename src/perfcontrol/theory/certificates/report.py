@@ -41,7 +41,18 @@ def certificate_row(certificate: Certificate) -> dict[str, Any]:
     """One certificate as plain data."""
     row: dict[str, Any] = {
         name: plain(getattr(certificate, name))
-        for name in ("kind", "applicable", "holds", "exists", "existence", "lhs", "rhs", "margin", "rate")
+        for name in (
+            "kind",
+            "applicable",
+            "holds",
+            "exists",
+            "existence",
+            "existence_status",
+            "lhs",
+            "rhs",
+            "margin",
+            "rate",
+        )
     }
     row["missing"] = list(certificate.missing)
     row["weights"] = plain(certificate.weights)
@@ -65,8 +76,8 @@ def verdict_rows(
         kinds: which ones, by name or as objects. batch, key: of the sharp one where it is given by name.
 
     Returns:
-        Dicts with "kind", "applicable", "missing", "holds", "exists", "existence", "lhs", "rhs", "margin", "rate",
-        "weights", "contributions", "assumptions", "values" and "text".
+        Dicts with "kind", "applicable", "missing", "holds", "exists", "existence", "existence_status", "lhs", "rhs",
+        "margin", "rate", "weights", "contributions", "assumptions", "values" and "text".
     """
     sharp = Sharp(batch=batch, key=key)
     return [certificate_row(certify(problem, sharp if kind == sharp.name else kind)) for kind in kinds]

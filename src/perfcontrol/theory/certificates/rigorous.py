@@ -72,9 +72,9 @@ class Rigorous(Declarations, AbstractCertificateKind):
             aggregate,
             mu,
             exists,
+            (FROM_NORMS, *items.assumptions),
             weights=constants.weights,
             contributions=contributions,
-            assumptions=(FROM_NORMS, *items.assumptions),
             values={"stability": stability, "constants": constants, "ingredients": items, "convexity": source},
             notes=tuple(notes),
         )

@@ -8,7 +8,7 @@ import numpy as np
 from perfcontrol._checks import check_integer
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.solvers import Result
-from perfcontrol.theory.assumptions import Assumption
+from perfcontrol.theory.assumptions import Assumption, reaction_status, word_of
 from perfcontrol.theory.certificates.certificate import Certificate
 from perfcontrol.theory.certificates.kind import AbstractCertificateKind
 from perfcontrol.theory.derivatives import obstacles
@@ -74,7 +74,8 @@ class Sharp(AbstractCertificateKind):
         else:
             M = problem.check_policy("M", self.M)
         if exists.exists is None:
-            exists = Existence(True, "the exact solver found one, to a relative residual of 1e-11")
+            found = Assumption("the stable policy, by its residual", "estimated")
+            exists = Existence(True, "the exact solver found one, to a relative residual of 1e-11", (found,))
         return self._at(problem, local_model(problem, M), exists)
 
     def _at(self, problem: PerformativeProblem, model: LocalModel, exists: Existence) -> Certificate:
@@ -90,7 +91,10 @@ class Sharp(AbstractCertificateKind):
         assumptions = [
             Assumption("derivatives at the stable policy, in floating point", "estimated"),
             Assumption("active constraints are strictly active", "estimated"),
+            *word_of(problem),
         ]
+        if reaction_status(problem.perturbation) != "proved":
+            assumptions.append(Assumption("the reaction is differentiable at the stable policy", "declared"))
         if self.samples and mean_step > 0:
             notes += self._mean_square(problem, model, mean_step, values)
             assumptions.append(Assumption("the mean-square step, from sampled Jacobians", "estimated"))
@@ -101,7 +105,7 @@ class Sharp(AbstractCertificateKind):
                 f"Over sampled pairs of feasible policies, far ones included, the best response stretched distances by "
                 f"at most {stretch:.3g} (an estimate; the test itself is only local)."
             )
-        return self.conclude(rate, 1.0, exists, assumptions=tuple(assumptions), values=values, notes=tuple(notes))
+        return self.conclude(rate, 1.0, exists, tuple(assumptions), values=values, notes=tuple(notes))
 
     def _mean_square(
         self, problem: PerformativeProblem, model: LocalModel, mean_step: float, values: dict[str, Any]
@@ -125,10 +129,7 @@ class Sharp(AbstractCertificateKind):
 
     def _absent(self, problem: PerformativeProblem) -> Certificate:
         """The verdict where the affine equation for a stable policy has no solution."""
-        return self.conclude(
-            spectral_radius(local_model(problem, problem.initial_policy()).response_jacobian),
-            1.0,
-            Existence(False, "the equation for it is affine and has no solution"),
-            assumptions=(Assumption("the gradient field M -> g(M; M) is affine, checked at points", "estimated"),),
-            notes=("There is no stable policy to converge to.",),
-        )
+        rate = spectral_radius(local_model(problem, problem.initial_policy()).response_jacobian)
+        affine = Assumption("the gradient field M -> g(M; M) is affine, checked at points", "estimated")
+        none = Existence(False, "the equation for it is affine and has no solution", (affine,))
+        return self.conclude(rate, 1.0, none, (), notes=("There is no stable policy to converge to.",))
