@@ -157,6 +157,7 @@ def test_laws_keep_the_default_precision():
 LAWS_REFUSED = {
     "low above high": (lambda: pc.Uniform([0.0, 1.0], [1.0, 0.5]), "low", "not exceed `high`"),
     "lengths that differ": (lambda: pc.Uniform([0.0, 1.0], [1.0, 2.0, 3.0]), "high", "(3,)", "(2,)"),
+    "negative scale": (lambda: pc.Rademacher([1.0, -2.0]), "scale", "-2", "absolute value"),
     "matrix for a vector": (lambda: pc.Rademacher(np.eye(2)), "scale", "(2, 2)"),
     "nan": (lambda: pc.Uniform([0.0, np.nan], 1.0), "low", "nan at index [1]", "finite"),
     "infinite": (lambda: pc.Constant([np.inf]), "value", "inf at index [0]"),

@@ -129,6 +129,12 @@ def check_time_varying(
         check_shape(name, array, inner, labels)
 
 
+def check_nonnegative(name: str, array: Any, remedy: str, because: str = "") -> None:
+    """Raise where an entry is known to be negative; `because` says what that would mean."""
+    if is_concrete(array) and np.any(np.asarray(array) < 0):
+        raise fail(name, f"{float(np.min(array))}", "be nonnegative" + because, remedy)
+
+
 def check_symmetric_psd(name: str, array: Array, remedy: str) -> None:
     """Raise unless every matrix in the last two axes is symmetric positive semidefinite (to rounding)."""
     if not is_concrete(array):

@@ -125,9 +125,15 @@ def check(**kwargs):
     pc.DensePerturbation(**{"scale": 0.5, **kwargs}).check((2, 2, 3), 3)
 
 
+def test_negative_constant_scale_is_taken_where_the_law_need_not_be_symmetric():
+    law = pc.DensePerturbation(-0.5, law=pc.Constant(np.arange(9.0)))
+    assert_close(law.mean(jnp.zeros((1, 2, 3)), 1), -0.5 * np.arange(9.0).reshape(1, 3, 3))
+
+
 REFUSED = {
     "unknown law": (lambda: pc.DensePerturbation(0.5, law="cauchy"), "law", "'cauchy'", "sphere"),
     "law in time": (lambda: pc.DensePerturbation(0.5, law=pc.Sequence(np.ones((3, 9)))), "law", "same at all times"),
+    "negative scale": (lambda: pc.DensePerturbation(-0.5, law="sphere"), "scale", "-0.5", "absolute value"),
     "scale shape": (lambda: check(scale=np.ones(2)), "scale", "(2,)", "(3,)"),
     "scale of the state alone": (lambda: check(scale=np.ones((3, 3)), on_input=True), "scale", "(3, 5)"),
     "mean shape": (lambda: check(mean=np.ones((3, 5))), "mean", "(3, 5)", "(3, 3)"),

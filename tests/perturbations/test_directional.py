@@ -88,6 +88,18 @@ def test_directional_covariance_matches_the_sum_over_directions():
     assert_close(law.covariance(M, 3).apply(jnp.asarray(X)), expected)
 
 
+def test_scale_map_of_either_sign_gives_the_same_law():
+    """Draws differ by the sign of ζ alone; all that is exact is the same. A constant of known sign must be positive."""
+    offset, slope = normal(16, 2), normal(17, 2, 2, 2, 3)
+    one, two = (pc.DirectionalPerturbation(DIRECTIONS, pc.Affine(sign * offset, sign * slope)) for sign in (1, -1))
+    M, X = normal(11, 2, 2, 3), normal(12, 3, 3)
+    ball = LiftedSet(pc.FrobeniusBall(0.5), pc.FullStructure(), (2, 2, 3))
+    assert_close(two.covariance(M, 3).apply(X), one.covariance(M, 3).apply(X), 0, 0)
+    assert_close(two.bound(ball, 3), one.bound(ball, 3))
+    assert_close(two.sensitivity(ball, 3), one.sensitivity(ball, 3))
+    assert_close(two.sample(jax.random.key(0), M, 3).dense(), -one.sample(jax.random.key(0), M, 3).dense(), 0, 0)
+
+
 def test_sensitivity_is_attained_by_one_direction_whose_scale_keeps_its_sign():
     """For Δ = scale ζ D with scale > 0, W₁ = |scale - scale'| E|ζ| ‖D‖, largest along the slope."""
     slope = np.asarray(normal(13, 1, 2, 2, 3))
@@ -137,6 +149,7 @@ DIRECTIONALS_REFUSED = {
     "nan": (lambda: pc.DirectionalPerturbation(DIRECTIONS.at[0, 1, 2].set(np.nan), [1, 1]), "directions", "[0, 1, 2]"),
     "rows": (lambda: check(directions=normal(1, 2, 4, 3)), "directions", "(2, 3, 3)", "(2, 3, 5)"),
     "columns": (lambda: check(directions=normal(1, 2, 3, 4)), "directions", "(2, 3, 4)"),
+    "negative scale": (lambda: pc.DirectionalPerturbation(DIRECTIONS, [1.0, -0.5]), "scale", "-0.5", "absolute value"),
     "scale shape": (lambda: check(scale=[1.0, 1.0, 1.0]), "scale", "(3,)", "(3, 2)"),
     "scale map shape": (lambda: check(scale=lambda M: jnp.sum(M)), "scale", "()", "(3, 2)"),
     "scale time axis": (lambda: check(scale=np.ones((4, 2))), "scale", "(4, 2)", "(3, 2)"),

@@ -10,7 +10,7 @@ from jaxtyping import Array, Key
 
 from perfcontrol._checks import as_array, fail
 from perfcontrol.perturbations.base import AbstractPerturbation, CovarianceOperator, DenseDraws, Draws, zero_mean
-from perfcontrol.perturbations.dependence import check_values
+from perfcontrol.perturbations.dependence import as_scale, check_values
 from perfcontrol.perturbations.scalar_laws import SCALAR_LAWS
 from perfcontrol.policy_maps import AbstractPolicyMap, as_policy_map, evaluate_map
 from perfcontrol.random_vectors import AbstractRandomVector
@@ -58,7 +58,8 @@ class DensePerturbation(AbstractPerturbation):
     For uncorrelated entries of unit variance and a common scale s: E[(sZ) X (sZ)ᵀ] = s² tr(X) I.
 
     Args:
-        scale: policy map, callable or array with values (), (T,), (n, p) or (T, n, p).
+        scale: policy map, callable or array with values (), (T,), (n, p) or (T, n, p). For a named law, which is
+            symmetric, only its square matters: a map may change sign, a constant below zero is refused.
         mean: policy map, callable or array with values (n, p) or (T, n, p); None is zero.
         law: of Z: "rademacher", "uniform" or "truncated_gaussian" (independent entries of zero mean and unit variance),
             "sphere" (uniform on the Frobenius sphere of radius √(n p), also of unit variances), or any random vector
@@ -66,7 +67,7 @@ class DensePerturbation(AbstractPerturbation):
         on_input: whether Δ acts on [x; u], p = n+m, instead of x, p = n.
 
     Raises:
-        InputError: unknown law, or shapes that do not fit (when the problem is built).
+        InputError: unknown law, a negative constant scale, or shapes that do not fit (when the problem is built).
     """
 
     scale: AbstractPolicyMap
@@ -76,7 +77,7 @@ class DensePerturbation(AbstractPerturbation):
     on_input: bool = eqx.field(static=True)
 
     def __init__(self, scale: Any, mean: Any = None, law: Any = "uniform", on_input: bool = False):
-        self.scale = as_policy_map("scale", scale)
+        self.scale = (as_policy_map if isinstance(law, AbstractRandomVector) else as_scale)("scale", scale)
         self.mean_map = None if mean is None else as_policy_map("mean", mean)
         if isinstance(law, AbstractRandomVector):
             self.law, self.kind = law, "vector"

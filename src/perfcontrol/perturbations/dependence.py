@@ -1,11 +1,19 @@
-"""The check that a policy map gives a family values of the right shape."""
+"""What the families ask of a policy map: scales without a pointless sign, and values of the right shape."""
 
 from typing import Any
 
 import jax
 
-from perfcontrol._checks import fail
-from perfcontrol.policy_maps import AbstractPolicyMap, evaluate_map
+from perfcontrol._checks import check_nonnegative, fail
+from perfcontrol.policy_maps import AbstractPolicyMap, ConstantMap, as_policy_map, evaluate_map
+
+
+def as_scale(name: str, value: Any) -> AbstractPolicyMap:
+    """The map that multiplies something whose sign does not matter: as a constant it has no reason to be negative."""
+    policy_map = as_policy_map(name, value)
+    if isinstance(policy_map, ConstantMap):
+        check_nonnegative(name, policy_map.value, "Only its square matters: pass its absolute value.")
+    return policy_map
 
 
 def check_values(

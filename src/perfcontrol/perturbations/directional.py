@@ -10,7 +10,7 @@ from jaxtyping import Array, Key
 from perfcontrol._checks import as_array, fail
 from perfcontrol._linalg import Matrix, as_dense, matvec, rmatvec
 from perfcontrol.perturbations.base import AbstractPerturbation, CovarianceOperator, Draws, zero_mean
-from perfcontrol.perturbations.dependence import check_values
+from perfcontrol.perturbations.dependence import as_scale, check_values
 from perfcontrol.perturbations.scalar_laws import SCALAR_LAWS
 from perfcontrol.policy_maps import AbstractPolicyMap, as_policy_map, evaluate_map
 
@@ -75,12 +75,14 @@ class DirectionalPerturbation(AbstractPerturbation):
 
     Args:
         directions: (k, n, n), or (k, n, n+m) to act on [x; u] (performative B).
-        scale: policy map, callable or array with values (T, k) or (k,).
+        scale: policy map, callable or array with values (T, k) or (k,): standard deviations, up to sign. The laws of ζ
+            are symmetric, so that only scale² matters: a map may change sign from policy to policy (an `Affine` one
+            does somewhere), but a constant below zero is refused.
         mean: policy map, callable or array with values (T, n, p) or (n, p); None is zero.
         law: of ζ: "rademacher", "uniform" or "truncated_gaussian" (cut at three standard deviations).
 
     Raises:
-        InputError: unknown law, or shapes that do not fit (when the problem is built).
+        InputError: unknown law, a negative constant scale, or shapes that do not fit (when the problem is built).
     """
 
     directions: Array
@@ -99,7 +101,7 @@ class DirectionalPerturbation(AbstractPerturbation):
             )
         if law not in SCALAR_LAWS:
             raise fail("law", repr(law), f"be one of {sorted(SCALAR_LAWS)}", "Pass one of these names.")
-        self.scale = as_policy_map("scale", scale)
+        self.scale = as_scale("scale", scale)
         self.mean_map = None if mean is None else as_policy_map("mean", mean)
         self.law = law
 

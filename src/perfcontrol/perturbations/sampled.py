@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Key
 
-from perfcontrol._checks import as_array, as_callable, fail, is_concrete
+from perfcontrol._checks import as_array, as_callable, check_nonnegative, fail
 from perfcontrol.perturbations.base import AbstractPerturbation, CovarianceOperator, DenseDraws, Draws
 
 
@@ -93,6 +93,5 @@ def _declared(name: str, value: Any) -> Array | None:
     if value is None:
         return None
     array = as_array(name, value)
-    if is_concrete(array) and bool(jnp.any(array < 0)):
-        raise fail(name, f"{float(jnp.min(array))}", "be nonnegative", "Pass None where it is not known.")
+    check_nonnegative(name, array, "Pass None where it is not known.")
     return array

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Key
 
+from perfcontrol._checks import check_nonnegative
 from perfcontrol.random_vectors.entrywise import Entrywise, paired
 
 
@@ -14,8 +15,11 @@ class Rademacher(Entrywise):
     """Independent entries mean_i ± scale_i with probability one half each.
 
     Args:
-        scale: (n,) or a number.
+        scale: (n,) or a number, not negative.
         mean: (n,) or a number.
+
+    Raises:
+        InputError: shapes that do not fit, or a negative scale.
     """
 
     scale: Array
@@ -23,6 +27,7 @@ class Rademacher(Entrywise):
 
     def __init__(self, scale: Any, mean: Any = 0):
         self.scale, self.centre = paired("scale", scale, "mean", mean)
+        check_nonnegative("scale", self.scale, "Only its square matters: pass its absolute value.")
 
     @property
     def mean(self) -> Array:

@@ -3,10 +3,9 @@
 from typing import Any
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array
 
-from perfcontrol._checks import as_array, fail, is_concrete
+from perfcontrol._checks import as_array, check_nonnegative, fail
 from perfcontrol.sets.base import AbstractSet
 
 
@@ -63,13 +62,8 @@ class RowSimplex(_Rows):
 
     def __init__(self, total: Any):
         self.total = as_array("total", total)
-        if is_concrete(self.total) and np.any(np.asarray(self.total) < 0):
-            raise fail(
-                "total",
-                f"{float(np.min(self.total))}",
-                "be nonnegative: the set is empty",
-                "Nonnegative entries cannot have a negative sum.",
-            )
+        remedy = "Nonnegative entries cannot have a negative sum."
+        check_nonnegative("total", self.total, remedy, ": the set is empty")
 
     def project(self, M: Array) -> Array:
         """Shift every row by the one threshold that makes its positive part sum to `total`."""
