@@ -24,8 +24,10 @@ EQUATION = re.compile(
     re.DOTALL,
 )
 # x_t, c_t, M^PS, x_{t+1} in docstrings, which are plain text; left alone: code, equations, the inside of tags.
-SCRIPT = re.compile(r"(?<![\w\\])(?P<base>\w|∇)(?P<mark>[_^])(?:\{(?P<group>[^{}]+)\}|(?P<plain>\w+))")
-UNTOUCHED = re.compile(r'(<pre.*?</pre>|<code.*?</code>|<(?:span|div) class="arithmatex">.*?</(?:span|div)>|<[^>]*>)', re.DOTALL)
+SCRIPT = re.compile(r"(?P<base>(?<!\w)\w|[∇‖)\]])(?P<mark>[_^])(?:\{(?P<group>[^{}]+)\}|(?P<plain>\w+))")
+UNTOUCHED = re.compile(
+    r'(<pre.*?</pre>|<code.*?</code>|<(?:span|div) class="arithmatex">.*?</(?:span|div)>|<[^>]*>)', re.DOTALL
+)
 RENDERER = Path(__file__).parent / "equations.js"
 
 
@@ -33,10 +35,12 @@ def on_page_markdown(markdown: str, **_) -> str:
     """Spell out the one-line entries of the reference."""
 
     def directive(match: re.Match[str]) -> str:
+        level = 3 if "\n## " in markdown[: match.start()] else 2  # below the group that it stands in
         members = json.dumps(match["members"].split()) if match["members"].strip() else "false"
         return (
             f"::: perfcontrol.{match['name']}\n    options:\n"
-            f'      heading: "pc.{match["name"]}"\n      toc_label: "{match["name"]}"\n      members: {members}\n'
+            f'      heading: "pc.{match["name"]}"\n      toc_label: "{match["name"]}"\n      heading_level: {level}\n'
+            f"      members: {members}\n"
         )
 
     return REFERENCE.sub(directive, markdown)
@@ -44,7 +48,8 @@ def on_page_markdown(markdown: str, **_) -> str:
 
 def render(equations: list[dict]) -> list[dict]:
     """`{"html": ...}` or `{"error": ...}` for each `{"latex": ..., "display": bool}`."""
-    done = node([str(RENDERER)], return_completed_process=True, input=json.dumps(equations).encode(), capture_output=True)
+    source = json.dumps(equations).encode()
+    done = node([str(RENDERER)], return_completed_process=True, input=source, capture_output=True)
     if done.returncode:
         raise RuntimeError(f"KaTeX did not run: {done.stderr.decode()}")
     return json.loads(done.stdout)

@@ -31,7 +31,10 @@ class PerformativeProblem(eqx.Module):
     """A linear system whose perturbations react to the deployed disturbance-action policy.
 
     x_{t+1} = A_t x_t + B_t u_t + Δ_t z_t + w_t for t = 0..T-1, Δ_t ~ D_t(deployed policy), z = x (or [x; u]);
-    u_t = -K_t x_t + Σ_{i=1..memory} M[i-1] w_{t-i};  C_T(M; M') = E Σ_{t=0..T} c_t(x_t, u_t).
+
+    u_t = -K_t x_t + Σ_{i=1..memory} M[i-1] w_{t-i};
+
+    C_T(M; M') = E Σ_{t=0..T} c_t(x_t, u_t).
 
     Args:
         system: A_t and B_t.

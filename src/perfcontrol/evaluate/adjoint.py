@@ -24,6 +24,7 @@ def path_gradient(problem: PerformativeProblem, path: Path | Trajectories) -> Ar
     """∇_M of the cost of an observed path, perturbations and noise held fixed.
 
     Args:
+        problem: the problem.
         path: states, inputs, noise and perturbation operators of one path (`Trajectories` with a sample axis give
             the mean over samples).
 
@@ -68,7 +69,17 @@ def path_gradient(problem: PerformativeProblem, path: Path | Trajectories) -> Ar
 def recover_noise(
     problem: PerformativeProblem, x: Float[Array, "T1 n"], u: Float[Array, "T1 m"], A: Float[Array, "T n n"]
 ) -> Float[Array, "T n"]:
-    """w_t = x_{t+1} - A_t x_t - B_t u_t from an observed path, A_t being the perturbed state matrix (Algorithm 1)."""
+    """w_t = x_{t+1} - A_t x_t - B_t u_t from an observed path (Algorithm 1).
+
+    Args:
+        problem: whose B_t it is.
+        x: states, (T+1, n).
+        u: inputs, (T+1, m).
+        A: the perturbed state matrices A_t + Δ_t, (T, n, n).
+
+    Returns:
+        The noise, (T, n).
+    """
     return x[1:] - jnp.einsum("tij,tj->ti", A, x[:-1]) - input_term(problem.system.B, u)
 
 
@@ -94,6 +105,13 @@ def sample_gradient(
     problem: PerformativeProblem, M: Any, *, deployed: Any = None, key: Any = None, samples: int = 1
 ) -> Array:
     """Mean pathwise gradient ∇_1 C_T(M; deployed): unbiased, from simulated paths.
+
+    Args:
+        problem: the problem.
+        M: free policy parameters, `problem.policy_shape`.
+        deployed: likewise, the policy that the world reacts to; None for M itself.
+        key: JAX random key; required.
+        samples: number of paths.
 
     Returns:
         Shape `problem.policy_shape`.

@@ -64,7 +64,7 @@ def expected_cost(problem: PerformativeProblem, M: Any, *, deployed: Any = None)
     Args:
         problem: with a QuadraticCost and a perturbation of known moments.
         M: free policy parameters, `problem.policy_shape`.
-        deployed: likewise; None for M itself.
+        deployed: likewise, the policy that the world reacts to; None for M itself.
 
     Returns:
         A scalar.
@@ -82,6 +82,12 @@ def expected_gradient(problem: PerformativeProblem, M: Any, *, deployed: Any = N
 
     A performatively stable policy has ∇_1 C_T(M; M) = 0 (or satisfies the variational inequality on the feasible
     set); a performatively optimal one has a zero total gradient.
+
+    Args:
+        problem: with a QuadraticCost and a perturbation of known moments.
+        M: free policy parameters, `problem.policy_shape`.
+        deployed: likewise, the policy that the world reacts to; None for M itself.
+        total: differentiate in both policies together; then `deployed` is left out.
 
     Returns:
         Shape `problem.policy_shape`.

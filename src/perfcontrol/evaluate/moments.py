@@ -24,7 +24,9 @@ from perfcontrol.problem import PerformativeProblem
 class StateMoments(eqx.Module):
     """Moments of z_t = [x_t; u_t] for t = 0..T.
 
-    mean: (T+1, n+m). second: (T+1, n+m, n+m), E z zᵀ, not centred.
+    Attributes:
+        mean: E z_t, (T+1, n+m).
+        second: E z_t z_tᵀ, not centred, (T+1, n+m, n+m).
     """
 
     mean: Float[Array, "T1 p"]
@@ -125,6 +127,11 @@ _compiled_cost = program(cost_by_moments, on_device=True)
 def state_moments(problem: PerformativeProblem, M: Any, *, deployed: Any = None) -> StateMoments:
     """Exact mean and second moment of [x_t; u_t] for t = 0..T under policy M while the world reacts to `deployed`.
 
+    Args:
+        problem: with a QuadraticCost and a perturbation of known moments.
+        M: free policy parameters, `problem.policy_shape`.
+        deployed: likewise, the policy that the world reacts to; None for M itself.
+
     Raises:
         InputError: wrong shapes, or a perturbation without known moments.
     """
@@ -134,7 +141,13 @@ def state_moments(problem: PerformativeProblem, M: Any, *, deployed: Any = None)
 
 
 def expected_cost_by_moments(problem: PerformativeProblem, M: Any, *, deployed: Any = None) -> Array:
-    """`expected_cost` by the forward moment recursion: slower, kept as an independent check of the engine."""
+    """`expected_cost` by the forward moment recursion: slower, kept as an independent check of the engine.
+
+    Args:
+        problem: with a QuadraticCost and a perturbation of known moments.
+        M: free policy parameters, `problem.policy_shape`.
+        deployed: likewise, the policy that the world reacts to; None for M itself.
+    """
     M, reacting = check_pair(problem, M, deployed)
     require_moments(problem)
     return check_finite("the expected cost", _compiled_cost(problem, M, reacting))

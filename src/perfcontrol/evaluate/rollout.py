@@ -34,8 +34,12 @@ class Path(eqx.Module):
 class Trajectories(eqx.Module):
     """Simulated paths.
 
-    x: (samples, T+1, n) states. u: (samples, T+1, m) inputs. w: (samples, T, n) noise.
-    cost: (samples,) summed over the T+1 stages. draws: the perturbations, every leaf with a leading sample axis.
+    Attributes:
+        x: states, (samples, T+1, n).
+        u: inputs, (samples, T+1, m).
+        w: noise, (samples, T, n).
+        cost: summed over the T+1 stages, (samples,).
+        draws: the perturbations, every leaf with a leading sample axis.
     """
 
     x: Float[Array, "*S T1 n"]
@@ -46,7 +50,12 @@ class Trajectories(eqx.Module):
 
 
 class Estimate(eqx.Module):
-    """A sample mean with its standard error."""
+    """A sample mean with its standard error.
+
+    Attributes:
+        mean: any shape.
+        standard_error: the same shape.
+    """
 
     mean: Float[Array, "..."]
     standard_error: Float[Array, "..."]
@@ -147,8 +156,9 @@ def simulate(
     Sample s uses `fold_in(key, s)`: the first samples stay the same when more are asked for.
 
     Args:
+        problem: the problem.
         M: free policy parameters, `problem.policy_shape`.
-        deployed: likewise.
+        deployed: likewise, the policy that the world reacts to; None for M itself.
         key: JAX random key; required.
         samples: number of paths.
 
@@ -163,6 +173,13 @@ def estimate_cost(
     problem: PerformativeProblem, M: Any, *, deployed: Any = None, key: Any = None, samples: int = 1024
 ) -> Estimate:
     """Monte Carlo estimate of C_T(M; deployed) with its standard error; needs no moments and any cost.
+
+    Args:
+        problem: the problem.
+        M: free policy parameters, `problem.policy_shape`.
+        deployed: likewise, the policy that the world reacts to; None for M itself.
+        key: JAX random key; required.
+        samples: number of paths.
 
     Raises:
         InputError: as `simulate`; at least two samples are needed for a standard error.

@@ -34,13 +34,17 @@ RANDOM_ORDER = (
 
 
 def stock_sensitivities(order: str) -> np.ndarray:
-    """The paper's 60 sensitivities, sum 2, in "ascending", "descending" or (the printed) "random" order.
+    """The paper's 60 sensitivities, sum 2.
 
     They are proportional to k² for k = 1..20, 4k³ for k = 21..40 and 5k³ for k = 41..60: the printed numbers to all
     nine digits.
 
-    >>> [round(float(value), 6) for value in stock_sensitivities("descending")[:3]]
-    [0.135861, 0.129181, 0.122723]
+    Examples:
+        >>> [round(float(value), 6) for value in stock_sensitivities("descending")[:3]]
+        [0.135861, 0.129181, 0.122723]
+
+    Args:
+        order: "ascending", "descending" or (as printed) "random".
     """
     if order not in ORDERS:
         raise fail("order", repr(order), f"be one of {ORDERS}", "Pass one of these names.")

@@ -10,7 +10,11 @@ from perfcontrol.random_vectors.base import AbstractRandomVector
 
 
 class Constant(AbstractRandomVector):
-    """The same vector (n,) every time."""
+    """The same vector every time.
+
+    Args:
+        value: (n,) or a number.
+    """
 
     value: Array
 

@@ -11,7 +11,11 @@ from perfcontrol.random_vectors.base import AbstractRandomVector
 
 
 class Empirical(AbstractRandomVector):
-    """Draws with replacement from the rows of samples (S, n)."""
+    """Draws with replacement from given rows.
+
+    Args:
+        samples: (S, n), one observation a row.
+    """
 
     samples: Array
 

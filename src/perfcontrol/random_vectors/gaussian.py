@@ -12,7 +12,12 @@ from perfcontrol.random_vectors.base import AbstractRandomVector
 
 
 class Gaussian(AbstractRandomVector):
-    """Gaussian of given mean (n,) and covariance (n, n), which may be singular. Unbounded."""
+    """Gaussian, unbounded.
+
+    Args:
+        mean: (n,).
+        covariance: (n, n); may be singular.
+    """
 
     centre: Array
     spread: Array

@@ -10,7 +10,11 @@ from perfcontrol.random_vectors.base import AbstractRandomVector
 
 
 class Sequence(AbstractRandomVector):
-    """A recorded disturbance, known in advance: values (T, n). For noise only."""
+    """A recorded disturbance, known in advance. For noise only.
+
+    Args:
+        values: (T, n), one vector a time step.
+    """
 
     values: Array
 

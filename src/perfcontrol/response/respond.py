@@ -170,6 +170,7 @@ def best_response(problem: PerformativeProblem, deployed: Any) -> Array:
     x_0. The least-norm minimiser where there are several and the set is affine.
 
     Args:
+        problem: with a QuadraticCost and a perturbation of known moments.
         deployed: free policy parameters that the world reacts to.
 
     Returns:
@@ -189,6 +190,11 @@ def residual(problem: PerformativeProblem, M: Any, *, deployed: Any = None) -> A
     """Relative natural residual ‖M - Proj(M - ηg)‖_F / (‖M‖_F + η‖g(0)‖_F), g = ∇_1 C_T(M; deployed), η = 1/‖Hessian‖.
 
     Zero exactly at a best response to `deployed`; with `deployed=None` (M itself) at a performatively stable policy.
+
+    Args:
+        problem: with a QuadraticCost and a perturbation of known moments.
+        M: free policy parameters, `problem.policy_shape`.
+        deployed: likewise, the policy that the world reacts to; None for M itself.
     """
     M, reacting = check_pair(problem, M, deployed)
     require_moments(problem)

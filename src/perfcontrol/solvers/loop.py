@@ -21,7 +21,11 @@ Record = Callable[[Array], Any]
 
 
 class SolveError(RuntimeError):
-    """A run that did not end well, raised by `solve(throw=True)`; `.solution` holds what was reached."""
+    """A run that did not end well, raised by `solve(throw=True)`.
+
+    Attributes:
+        solution: the `Solution`, with what was reached.
+    """
 
     def __init__(self, message: str, solution: "Solution"):
         super().__init__(message)
@@ -75,9 +79,12 @@ class AbstractSolver(eqx.Module):
 class Solution(eqx.Module):
     """What `solve` returns.
 
-    M: the policy (free parameters), finite always. result: a `Result`. steps: iterations taken; where the run
-    failed, the iteration at which it did. history: `record` at steps 0, every, 2·every, ... (leading axis), the
-    last value repeated once a run has ended. stats: method-specific numbers, such as `unique` and `residual`.
+    Attributes:
+        M: the policy (free parameters), finite always.
+        result: a `Result`.
+        steps: iterations taken; where the run failed, the iteration at which it did.
+        history: `record` at steps 0, every, 2·every, ... (leading axis), the last value repeated once a run has ended.
+        stats: method-specific numbers, such as `unique` and `residual`.
     """
 
     M: Array

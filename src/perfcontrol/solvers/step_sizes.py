@@ -13,8 +13,9 @@ from perfcontrol._checks import as_array, fail, is_concrete
 class InverseStep(eqx.Module):
     """η_n = phi1 / (n + phi2): the diminishing step of Theorem 1.
 
-    >>> float(InverseStep(2.0, 8.0)(0))
-    0.25
+    Examples:
+        >>> float(InverseStep(2.0, 8.0)(0))
+        0.25
 
     Args:
         phi1: a positive number.

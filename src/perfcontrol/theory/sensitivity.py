@@ -45,12 +45,15 @@ def estimate_sensitivity(
     """The sensitivities ε_t per unit of ‖M - M'‖_F (free parameters).
 
     Args:
+        problem: the problem.
         method: "analytic": what the family knows. "coupling": the mean speed E ‖dΔ_t/dM [V]‖ of the draws with the
             randomness held fixed, by automatic differentiation, the largest over sampled policies and directions V;
             any coupling bounds W₁ from above, so only the search over M and V is a sample. "transport": optimal
             transport between empirical measures at pairs of policies (needs POT); biased upward in many dimensions.
-        key: JAX random key; needed except for "analytic". policies: how many feasible policies (or pairs).
-        samples: draws at each. distance: between the policies of a pair ("transport").
+        key: JAX random key; needed except for "analytic".
+        policies: how many feasible policies (or pairs).
+        samples: draws at each.
+        distance: between the policies of a pair ("transport").
 
     Raises:
         InputError: an unknown method; an analytic value that the family does not know; POT missing.

@@ -11,7 +11,11 @@ from perfcontrol.sets.structures.base import AbstractStructure
 
 
 class RepeatedBlock(AbstractStructure):
-    """(H, m/count, n/count) -> blockdiag(M, ..., M) with `count` copies in every lag."""
+    """(H, m/count, n/count) -> blockdiag(M, ..., M) with `count` copies in every lag.
+
+    Args:
+        count: the number of blocks; it divides m and n.
+    """
 
     count: int = eqx.field(static=True)
 

@@ -12,17 +12,25 @@ from perfcontrol.theory.assumptions import Assumption, Status
 class Certificate:
     """The verdict of one certificate on one problem.
 
-    kind: its name. verdict: one sentence.
-    applicable: whether its assumptions can be met at all; if not, `missing` names what is lacking, and `holds`,
-        `lhs`, `rhs`, `rate` are None. Not applicable never means "does not hold".
-    holds: True where this certificate proves (sharp: finds) that the best response Φ contracts.
-    exists: whether a performatively stable policy exists: True, False or None (unknown); `existence` says why, and
-        `existence_status` how it is known: "proved", "declared" (it rests on the user's word) or "estimated".
-    lhs, rhs: the two sides; it holds where lhs < rhs. margin: rhs - lhs.
-    rate: its bound of the contraction rate of Φ (sharp: the local rate itself).
-    weights: (T,), what one unit of ε_t adds to lhs: the propagation and aggregation of sensitivities; None for
-        kinds that do not split that way. contributions: (T,), ε_t times weights.
-    assumptions: what the verdict rests on. values: further numbers, by name.
+    Attributes:
+        kind: its name.
+        verdict: one sentence.
+        applicable: whether its assumptions can be met at all; if not, `holds`, `lhs`, `rhs` and `rate` are None. Not
+            applicable never means "does not hold".
+        missing: what keeps it from being applicable.
+        holds: True where this certificate proves (sharp: finds) that the best response Φ contracts.
+        exists: whether a performatively stable policy exists: True, False or None (unknown).
+        existence: why.
+        existence_status: how that is known: "proved", "declared" (it rests on the user's word) or "estimated".
+        lhs: the left side; it holds where lhs < rhs.
+        rhs: the right side.
+        rate: its bound of the contraction rate of Φ (sharp: the local rate itself).
+        weights: (T,), what one unit of ε_t adds to lhs: the propagation and aggregation of sensitivities; None for
+            kinds that do not split that way.
+        contributions: (T,), ε_t times weights.
+        assumptions: what the verdict rests on.
+        values: further numbers, by name.
+        notes: remarks, in sentences.
     """
 
     kind: str

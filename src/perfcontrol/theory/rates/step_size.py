@@ -73,6 +73,7 @@ def theorem_step_size(
     φ₁/(1 + 1/φ₂) ≥ 2/m.
 
     Args:
+        problem: the problem.
         kind: `pc.Rigorous(...)`, or `pc.Paper(...)` for the printed constants; or its name.
         declared: settings of the kind where it is given by name.
 

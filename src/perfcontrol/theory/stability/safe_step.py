@@ -70,7 +70,10 @@ def safe_step(problem: PerformativeProblem, batch: int = 1, *, safety: float = S
     where the reaction is strong, runs that start far away may grow from a third of it on.
 
     Args:
-        batch: paths a step of RSGD. safety: fraction of the threshold. key: JAX random key; a fixed one if None.
+        problem: with a QuadraticCost and a perturbation of known moments.
+        batch: paths a step of RSGD.
+        safety: fraction of the threshold.
+        key: JAX random key; a fixed one if None.
 
     Returns:
         The step, on the gradient of the cost summed over stages, as `pc.RSGD` takes it.

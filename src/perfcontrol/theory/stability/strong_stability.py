@@ -122,7 +122,8 @@ def strong_stability(
     """κ, γ, Q and L for the closed loop A - BK, searched over the rate and verified.
 
     Args:
-        system: A and B. K: (m, n), or (T+1, m, n); u = -K x.
+        system: A and B.
+        K: (m, n), or (T+1, m, n); u = -K x.
         perturbation_bound: ξ_t, (T,) or a number; then `.factors` bounds the perturbed steps almost surely.
         objective: what to minimise over the search; None: κ¹⁰/γ², the size of the printed constants.
 
