@@ -26,8 +26,12 @@ from perfcontrol.problem import PerformativeProblem
 class Fit:
     """A plant identified from logs. Built by `pc.fit`.
 
-    directions: D_k, (k, n, p). mean_features, scale_features: what the reaction follows, `.name` in words.
     `A` is the mean of the state matrix at M = 0 (where A + Θ(M) is A), the reaction of the mean is counted from there.
+
+    Attributes:
+        directions: D_k, (k, n, p).
+        mean_features: what the reaction of the mean follows, `.name` in words.
+        scale_features: what the reaction of the scale follows.
     """
 
     logs: Logs
@@ -158,8 +162,11 @@ class Fit:
         """The fitted plant as a problem.
 
         Args:
-            cost, horizon, feasible_set, structure: as `pc.PerformativeProblem` takes them.
+            cost: as `pc.PerformativeProblem` takes it.
+            horizon: likewise.
+            feasible_set: likewise.
             initial_state: its law; None for mean and covariance of the logged first states.
+            structure: as `pc.PerformativeProblem` takes it.
             law: of the random multiples of the directions. Costs of quadratic stages do not depend on it.
 
         Raises:
@@ -196,7 +203,14 @@ class Fit:
         `jax.vmap(lambda p: pc.solve(p, pc.StablePoint(), throw=False))(ensemble)`.
 
         Args:
-            k: how many. key: JAX random key. Others as in `problem`.
+            k: how many.
+            key: JAX random key.
+            cost: as `problem` takes it, and all that follow.
+            horizon: likewise.
+            feasible_set: likewise.
+            initial_state: likewise.
+            structure: likewise.
+            law: likewise.
         """
         weights = self._weights(check_integer("k", k, 1), check_key(key))
         n, _ = self._sizes
