@@ -136,8 +136,8 @@ class AbstractPerturbation(eqx.Module):
     def check(self, policy_shape: tuple[int, int, int], horizon: int) -> None:
         """Raise InputError where this law does not fit a problem of that shape; looks at shapes only."""
 
-    def policy_free_mean(self) -> bool:
-        """Whether E Δ_t is known not to depend on the policy."""
+    def policy_free_mean(self, feasible_set: Any) -> bool:
+        """Whether the family knows E Δ_t to be the same for every policy of the set."""
         return False
 
 

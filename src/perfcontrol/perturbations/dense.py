@@ -155,7 +155,7 @@ class DensePerturbation(AbstractPerturbation):
         shape = self._shape(M)
         return _ColouredCovariance(scales, self._vector(M).covariance.reshape(*shape, *shape))
 
-    def policy_free_mean(self) -> bool:
+    def policy_free_mean(self, feasible_set: Any) -> bool:
         return (self.law is None or self.scale.constant) and (self.mean_map is None or self.mean_map.constant)
 
     def bound(self, feasible_set: Any, horizon: int) -> Array | None:

@@ -144,7 +144,7 @@ class DirectionalPerturbation(AbstractPerturbation):
     def covariance(self, M: Array, horizon: int) -> CovarianceOperator:
         return DirectionalCovariance(self.scales(M, horizon) ** 2, self.directions)
 
-    def policy_free_mean(self) -> bool:
+    def policy_free_mean(self, feasible_set: Any) -> bool:
         return self.mean_map is None or self.mean_map.constant
 
     def bound(self, feasible_set: Any, horizon: int) -> Array | None:

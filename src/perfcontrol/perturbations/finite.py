@@ -131,7 +131,7 @@ class FinitePerturbation(AbstractPerturbation):
     def covariance(self, M: Array, horizon: int) -> CovarianceOperator:
         return _FiniteCovariance(self.distribution(M, horizon), self.mean(M, horizon), self.values)
 
-    def policy_free_mean(self) -> bool:
+    def policy_free_mean(self, feasible_set: Any) -> bool:
         return self.probabilities.constant
 
     def bound(self, feasible_set: Any, horizon: int) -> Array:

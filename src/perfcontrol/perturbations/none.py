@@ -62,5 +62,5 @@ class NoPerturbation(AbstractPerturbation):
     def sensitivity(self, feasible_set: Any, horizon: int) -> Array:
         return jnp.zeros(horizon)
 
-    def policy_free_mean(self) -> bool:
+    def policy_free_mean(self, feasible_set: Any) -> bool:
         return True

@@ -181,7 +181,7 @@ class StockPerturbation(AbstractPerturbation):
             return None
         lowest, highest = self._growth_range(horizon)
         # ‖row of the portfolio‖₁ is known on the simplex; elsewhere at most √L times the radius over the exposure
-        if self.fixes_rows(feasible_set) and feasible_set.nonnegative:
+        if self.policy_free_mean(feasible_set) and feasible_set.nonnegative:
             weight = feasible_set.row_total / self.exposure
             value_low, value_high = weight * lowest, weight * highest
         else:
@@ -194,11 +194,11 @@ class StockPerturbation(AbstractPerturbation):
     def sensitivity(self, feasible_set: Any, horizon: int) -> Array:
         """√(2 Var e) / exposure where the set fixes the row sums, else with L (E e)² added under the root."""
         variance = self.variance
-        if not self.fixes_rows(feasible_set):
+        if not self.policy_free_mean(feasible_set):
             variance = variance + feasible_set.policy_size / 2 * self.first_moment**2
         return jnp.sqrt(2 * variance) / self.exposure
 
-    def fixes_rows(self, feasible_set: Any) -> bool:
+    def policy_free_mean(self, feasible_set: Any) -> bool:
         """Whether the set fixes the row sums of the portfolio: those of the free parameters, if these are its block."""
         return feasible_set.row_total is not None and feasible_set.free_columns == feasible_set.policy_size // 2
 

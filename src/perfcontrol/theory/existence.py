@@ -15,7 +15,7 @@ import jax
 import numpy as np
 
 from perfcontrol.costs import QuadraticCost
-from perfcontrol.perturbations import DirectionalPerturbation, NoPerturbation, SampledPerturbation, StockPerturbation
+from perfcontrol.perturbations import DirectionalPerturbation, NoPerturbation, SampledPerturbation
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.theory.assumptions import Assumption, Status, reaction_status, word_of
 from perfcontrol.theory.derivatives import hessian_without_reaction, tangent_basis
@@ -93,13 +93,11 @@ def constant_mean(problem: PerformativeProblem) -> bool:
     """Whether E Δ_t is the same for every policy of the set: known to the family, or an affine map with no slope
     along the set."""
     law = problem.perturbation
-    if law.policy_free_mean():
+    if law.policy_free_mean(problem.lifted_set):
         return True
-    if isinstance(law, StockPerturbation):  # its mean follows the row sums of the portfolio
-        return law.fixes_rows(problem.lifted_set)
     mean_map = getattr(law, "mean_map", None)
     derivative = None if mean_map is None else mean_map.derivative()
-    if derivative is None or not eqx.tree_at(lambda law: law.mean_map, law, None).policy_free_mean():
+    if derivative is None or not eqx.tree_at(lambda law: law.mean_map, law, None).policy_free_mean(problem.lifted_set):
         return False
     slopes = derivative.reshape(-1, *problem.lifted_shape)
     free = np.asarray(jax.vmap(problem.structure.adjoint)(slopes)).reshape(slopes.shape[0], -1)
