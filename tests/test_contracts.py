@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 
 import perfcontrol as pc
-from perfcontrol.policy_maps import AbstractPolicyMap
 from tests.contracts.certificate import CertificateContract
 from tests.contracts.cost import CostContract
 from tests.contracts.feasible_set import SetContract
@@ -19,7 +18,7 @@ from tests.contracts.structure import StructureContract
 
 KINDS = {
     "law": (pc.AbstractRandomVector, RandomVectorContract, lambda row: type(row.law())),
-    "map": (AbstractPolicyMap, PolicyMapContract, lambda row: type(row.policy_map())),
+    "map": (pc.AbstractPolicyMap, PolicyMapContract, lambda row: type(row.policy_map())),
     "set": (pc.AbstractSet, SetContract, lambda row: type(row.feasible_set())),
     "structure": (pc.AbstractStructure, StructureContract, lambda row: type(row.structure())),
     "cost": (pc.AbstractCost, CostContract, lambda row: type(row.cost())),

@@ -31,7 +31,7 @@ from perfcontrol.perturbations import (
     StockPerturbation,
 )
 from perfcontrol.policy import DisturbanceAction
-from perfcontrol.policy_maps import Affine, Function, Norm
+from perfcontrol.policy_maps import AbstractPolicyMap, Affine, Function, Norm
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.random_vectors import (
     AbstractRandomVector,
@@ -98,6 +98,7 @@ __all__ = [
     "AbstractCertificateKind",
     "AbstractCost",
     "AbstractPerturbation",
+    "AbstractPolicyMap",
     "AbstractRandomVector",
     "AbstractSet",
     "AbstractSolver",
