@@ -34,7 +34,7 @@ class Separable:
         a = self.inverse_root @ w
         squared = a @ a
         self.unit = a / xp.sqrt(xp.where(squared > 0, squared, 1))
-        shift = xp.where(self.regular, 0, 1) * xp.eye(H * m, dtype=G.dtype)
+        shift = xp.where(self.regular, 0, 1).astype(G.dtype) * xp.eye(H * m, dtype=G.dtype)
         self.along = G + squared * G_mean + shift
 
     def _separately(self, gradients: Any) -> Any:
