@@ -73,7 +73,7 @@ def _separable_method(problem: PerformativeProblem, world: CostToGo, form: Facto
             return Affine(problem.feasible_set, quadratic(problem, world))
         return AffineByProducts(problem.feasible_set, quadratic_by_passes(problem, world))
 
-    return Separable(form, dense, lambda M: weigh(problem, world, M)[1])
+    return Separable(form, dense)
 
 
 def _sound(form: Any) -> Any:

@@ -18,8 +18,8 @@ class Separable:
         factors: of the quadratic. dense: the method that serves where G or Σ is singular.
     """
 
-    def __init__(self, factors: Factors, dense: Callable[[], Any], gradient: Operator):
-        self.factors, self.dense, self.gradient = factors, dense, gradient
+    def __init__(self, factors: Factors, dense: Callable[[], Any]):
+        self.factors, self.dense = factors, dense
         xp, self.linalg = numerics(factors)
         _, G, G_mean, Sigma, w = factors
         self.shape = H, m, n = factors.linear.shape
@@ -60,7 +60,7 @@ class Separable:
 
         def regular() -> tuple[Any, Any]:
             M = self._separately(self.factors.linear[None])[0]
-            M = M + self._separately(self.gradient(M)[None])[0]  # one step of iterative refinement
+            M = M + self._separately(self.factors.gradient(M)[None])[0]  # one step of iterative refinement
             return M, self.regular
 
         return cond(self.regular, regular, lambda: self.dense().minimise(start))
