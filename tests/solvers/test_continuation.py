@@ -67,7 +67,10 @@ def test_continuation_satisfies_the_variational_inequality_where_the_mean_reacts
         assert solution.result == pc.Result.success, seed
         assert float(solution.stats["residual"]) <= 1e-11
         assert violation(problem, solution.M) <= 1e-6, seed
-        lost += pc.solve(problem, pc.StablePoint(), throw=False).result != pc.Result.success
+        alone = pc.solve(problem, pc.StablePoint(rescue=False), throw=False).result == pc.Result.success
+        stable = pc.solve(problem, pc.StablePoint())
+        assert float(stable.stats["residual"]) <= 1e-11 and bool(stable.stats["rescued"]) == (not alone), seed
+        lost += not alone
     assert lost > 0, "these problems should be too hard for Newton's method alone"
 
 

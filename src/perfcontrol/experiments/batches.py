@@ -13,7 +13,8 @@ from jaxtyping import Array
 from perfcontrol.evaluate.exact import exact_cost
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.solvers import RSGD, Result
-from perfcontrol.solvers.loop import State, run_steps
+from perfcontrol.solvers.base import State
+from perfcontrol.solvers.runs import run_steps
 
 LANES = 16  # runs worked on together on one device: they stay in cache
 COST_LANES = 32  # policies likewise

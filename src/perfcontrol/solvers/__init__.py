@@ -1,12 +1,13 @@
 """Which policy: the solver loop and the methods, one a file."""
 
+from perfcontrol.solvers.base import AbstractSolver, Solution, SolveError
 from perfcontrol.solvers.continuation import Continuation
 from perfcontrol.solvers.gradients import Exact, Pathwise
-from perfcontrol.solvers.loop import AbstractSolver, Solution, SolveError, solve
 from perfcontrol.solvers.result import Result
 from perfcontrol.solvers.rrm import RRM
 from perfcontrol.solvers.rsgd import RSGD
 from perfcontrol.solvers.schedules import Greedy, Lazy
+from perfcontrol.solvers.solve import solve
 from perfcontrol.solvers.stable_point import StablePoint
 from perfcontrol.solvers.step_sizes import InverseStep
 

@@ -18,8 +18,8 @@ from perfcontrol.response import residual_of, respond, response_jacobian
 from perfcontrol.response.projected import nearest, projection_slope
 from perfcontrol.response.quadratic import DENSE_LIMIT
 from perfcontrol.sets import Unconstrained
+from perfcontrol.solvers.base import State, start
 from perfcontrol.solvers.exact_solver import AbstractExactSolver
-from perfcontrol.solvers.loop import State, start
 from perfcontrol.solvers.result import Result
 
 CORRECTIONS = 6  # Newton steps across the curve before a step along it counts as too long

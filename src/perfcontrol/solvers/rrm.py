@@ -9,8 +9,8 @@ from perfcontrol._linalg import frobenius
 from perfcontrol._programs import Numbers, choose, numerics
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.response import residual_of, respond
+from perfcontrol.solvers.base import State, start
 from perfcontrol.solvers.exact_solver import AbstractExactSolver
-from perfcontrol.solvers.loop import State, start
 from perfcontrol.solvers.result import Result
 
 

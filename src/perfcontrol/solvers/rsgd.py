@@ -10,8 +10,8 @@ from jaxtyping import Array
 from perfcontrol._checks import check_integer
 from perfcontrol._programs import Numbers, choose
 from perfcontrol.problem import PerformativeProblem
+from perfcontrol.solvers.base import AbstractSolver, State, start
 from perfcontrol.solvers.gradients import Pathwise
-from perfcontrol.solvers.loop import AbstractSolver, State, start
 from perfcontrol.solvers.result import Result
 from perfcontrol.solvers.schedules import Greedy
 from perfcontrol.solvers.step_sizes import as_step_size

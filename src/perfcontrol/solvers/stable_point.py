@@ -5,6 +5,7 @@ Repeated minimisation while it contracts well; else Newton steps on F(M) = Φ(M)
 minimisation runs away from them.
 """
 
+import math
 from typing import Any
 
 import equinox as eqx
@@ -18,14 +19,16 @@ from perfcontrol._programs import Numbers, choose, cond, numerics, program, whil
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.response import Response, residual_of, respond, response_jacobian, response_pushforward
 from perfcontrol.response.projected import nearest
+from perfcontrol.solvers.base import AbstractSolver, State, start
+from perfcontrol.solvers.continuation import Continuation
 from perfcontrol.solvers.exact_solver import AbstractExactSolver
-from perfcontrol.solvers.loop import State, start
 from perfcontrol.solvers.result import Result
 
 CONTRACTING = 0.1  # repeated minimisation goes on while each step shrinks the gap at least tenfold
 HALVINGS = 6
 KRYLOV = 30
 DENSE = 64  # free parameters up to which Φ' is a matrix, not products
+CONTINUED = 256  # free parameters up to which a stable policy is also looked for by continuation
 FAR = 1e8  # growth of ‖M‖ over 1 + ‖M_0‖ + ‖Φ(M_0)‖ beyond which a Newton step is refused: see `step`
 
 
@@ -42,16 +45,28 @@ class StablePoint(AbstractExactSolver):
     """The fixed point M^PS = Φ(M^PS), to a relative natural residual of `tolerance`.
 
     Needs a quadratic cost and known moments; no sampling. Finds stable points at which repeated minimisation
-    diverges. `.stats`: `residual` (relative natural residual), `unique` (of the best response, at M^PS),
-    `rate` (last ratio of gaps).
+    diverges. Where Newton's method starts too far off and the set is bounded, `solve` goes on with
+    `pc.Continuation` from the same start (with known numbers only: not under jit or vmap).
+
+    `.stats`: `residual` (relative natural residual), `unique` (of the best response, at M^PS), `rate` (last ratio of
+    gaps), `rescued` (whether continuation found the answer; `steps` counts its steps, too, `history` does not).
 
     Args:
         tolerance: None for 1e-11 in float64, 1e-5 in float32.
         max_steps: at most so many steps.
+        rescue: whether to go on with continuation.
     """
 
-    def __init__(self, tolerance: float | None = None, max_steps: int = 60):
+    rescues: bool = eqx.field(static=True)
+
+    def __init__(self, tolerance: float | None = None, max_steps: int = 60, rescue: bool = True):
         super().__init__(tolerance, max_steps)
+        self.rescues = rescue
+
+    def rescue(self, problem: PerformativeProblem) -> AbstractSolver | None:
+        bounded = problem.feasible_set.radius(problem.policy_shape) is not None
+        held = math.prod(problem.policy_shape) <= CONTINUED
+        return Continuation(self.tolerance) if self.rescues and bounded and held else None
 
     def init(self, problem: PerformativeProblem, M0: Any) -> State:
         # The first step moves nowhere and evaluates M0.
@@ -107,7 +122,12 @@ class StablePoint(AbstractExactSolver):
         unfinished = Result.running if stopped else Result.not_converged
         failed = choose(state.result == Result.nonfinite, Result.nonfinite, unfinished)
         result = choose(residual <= check_tolerance(self.tolerance, state.M.dtype), Result.success, failed)
-        return result, {"residual": residual, "unique": state.own.unique, "rate": state.own.ratio}
+        return result, {
+            "residual": residual,
+            "unique": state.own.unique,
+            "rate": state.own.ratio,
+            "rescued": numerics(state.M)[0].asarray(False),
+        }
 
 
 def _newton_direction(problem: PerformativeProblem, M: Any, response: Any) -> Any:

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 import perfcontrol as pc
-from perfcontrol.solvers.loop import CHUNK, State, start
+from perfcontrol.solvers.base import State, start
+from perfcontrol.solvers.runs import CHUNK
 from tests.solvers.problems import performative_prediction
 from tests.tools import assert_close
 

@@ -1,0 +1,95 @@
+"""The interface of a solver: `init`, `step`, `finish` on a state that every solver carries; what a run returns."""
+
+import abc
+from typing import Any
+
+import equinox as eqx
+from jaxtyping import Array
+
+from perfcontrol._programs import Numbers, numerics
+from perfcontrol.problem import PerformativeProblem
+from perfcontrol.solvers.result import Result
+
+
+class SolveError(RuntimeError):
+    """A run that did not end well, raised by `solve(throw=True)`.
+
+    Attributes:
+        solution: the `Solution`, with what was reached.
+    """
+
+    def __init__(self, message: str, solution: "Solution"):
+        super().__init__(message)
+        self.solution = solution
+
+
+class State(eqx.Module):
+    """What every solver carries: the iterate, the number of steps taken, how the run stands, the solver's own."""
+
+    M: Numbers
+    steps: Numbers
+    result: Result
+    own: Any
+
+
+class AbstractSolver(eqx.Module):
+    """A method with frozen settings."""
+
+    @property
+    @abc.abstractmethod
+    def max_steps(self) -> int:
+        """Steps that `solve` runs at most unless told otherwise."""
+
+    @property
+    def needs_key(self) -> bool:
+        """Whether steps draw random numbers."""
+        return False
+
+    @property
+    def from_host(self) -> bool:
+        """Whether steps do their heavy work in programs of their own, so that the loop need not be compiled."""
+        return False
+
+    def rescue(self, problem: PerformativeProblem) -> "AbstractSolver | None":
+        """The method that `solve` tries from the same start where this one fails; None: the failure is reported."""
+        return None
+
+    @abc.abstractmethod
+    def check(self, problem: PerformativeProblem) -> None:
+        """Raise InputError where this method does not apply to the problem."""
+
+    @abc.abstractmethod
+    def init(self, problem: PerformativeProblem, M0: Any) -> State:
+        """The state before the first step."""
+
+    @abc.abstractmethod
+    def step(self, problem: PerformativeProblem, state: State, key: Any) -> State:
+        """One iteration; `key` is that iteration's own."""
+
+    @abc.abstractmethod
+    def finish(self, problem: PerformativeProblem, state: State, stopped: bool) -> tuple[Result, dict[str, Any]]:
+        """Result and statistics of the last state; `stopped` says that max_steps of `solve` cut the run short."""
+
+
+class Solution(eqx.Module):
+    """What `solve` returns.
+
+    Attributes:
+        M: the policy (free parameters), finite always.
+        result: a `Result`.
+        steps: iterations taken; where the run failed, the iteration at which it did.
+        history: `record` at steps 0, every, 2·every, ... (leading axis), the last value repeated once a run has ended.
+        stats: method-specific numbers, such as `unique` and `residual`.
+    """
+
+    M: Array
+    result: Result
+    steps: Array
+    history: Any
+    stats: dict[str, Array]
+
+
+def start(M0: Any, own: Any = None) -> State:
+    """The first state."""
+    xp, _ = numerics(M0)
+    return State(M0, xp.zeros((), int), Result.running, own)

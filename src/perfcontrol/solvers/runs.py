@@ -1,0 +1,151 @@
+"""How a run goes: traced whole, in compiled chunks, or step by step from the host; recorded alike each way."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from perfcontrol._programs import numerics, on_host, program
+from perfcontrol.problem import PerformativeProblem
+from perfcontrol.solvers.base import AbstractSolver, State
+from perfcontrol.solvers.result import Result
+
+CHUNK = 500  # iterations compiled together: long enough to cost nothing, short enough to stop early
+
+Record = Callable[[Array], Any]
+
+
+def identity(M: Any) -> Any:
+    """The record that keeps the policy itself."""
+    return M
+
+
+class Run(NamedTuple):
+    """What is to be run: `total` iterations from M0, `record` of the policy kept after each `every`."""
+
+    problem: PerformativeProblem
+    solver: AbstractSolver
+    M0: Any
+    key: Array | None
+    total: int
+    record: Record = identity
+    every: int = 1
+    progress: Callable[[int, int], None] | None = None
+
+
+def _run(
+    solver: AbstractSolver,
+    problem: PerformativeProblem,
+    state: State,
+    key: Array | None,
+    first: Array | int,
+    count: int,
+    record: Record,
+    every: int,
+) -> tuple[State, Any]:
+    """`count` iterations, a multiple of `every`, recorded after each `every`; ended runs stay as they are."""
+
+    def iterate(state: State, n: Array) -> State:
+        step_key = None if key is None else jax.random.fold_in(key, n)
+        return jax.lax.cond(
+            state.result == Result.running, lambda s: solver.step(problem, s, step_key), lambda s: s, state
+        )
+
+    def block(state: State, index: Array) -> tuple[State, Any]:
+        if every == 1:
+            state = iterate(state, first + index)
+        else:
+            state = jax.lax.fori_loop(0, every, lambda j, s: iterate(s, first + index * every + j), state)
+        return state, record(state.M)
+
+    return jax.lax.scan(block, state, jnp.arange(count // every))
+
+
+def run_steps(
+    solver: AbstractSolver, problem: PerformativeProblem, state: State, key: Array | None, first: Array, count: int
+) -> tuple[State, Array]:
+    """`count` iterations from iteration `first` on, and the iterate after each; pure, for batched runs of one's own."""
+    return _run(solver, problem, state, key, first, count, identity, 1)
+
+
+_compiled_run = program(_run, on_device=True)
+_compiled_record = program(lambda record, M: record(M))
+_compiled_init = program(lambda solver, problem, M0: solver.init(problem, M0), on_device=True)
+
+
+def traced(run: Run) -> tuple[State, Any]:
+    """The whole run inside somebody else's trace."""
+    problem, solver, M0, key, total, record, every, _ = run
+    state = solver.init(problem, M0)
+    history = [jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], record(M0))]
+    whole = total - total % every
+    state, recorded = _run(solver, problem, state, key, 0, whole, record, every)
+    history.append(recorded)
+    if total % every:
+        state, _ = _run(solver, problem, state, key, whole, total % every, _nothing, 1)
+    return state, _joined(history)
+
+
+def in_chunks(run: Run) -> tuple[State, Any]:
+    """The run in compiled chunks."""
+    problem, solver, M0, key, total, record, every, progress = run
+    state = _compiled_init(solver, problem, M0)
+    history = [_recorded(record, M0)]
+    chunk = max(every, CHUNK - CHUNK % every)
+    done = 0
+    while done < total:
+        count = min(chunk, total - done)
+        whole = count - count % every
+        first = np.asarray(done)
+        if whole:
+            state, recorded = _compiled_run(solver, problem, state, key, first, whole, record, every)
+            history.append(recorded)
+        if count - whole:
+            state, _ = _compiled_run(solver, problem, state, key, first + whole, count - whole, _nothing, 1)
+        done += count
+        if progress is not None:
+            progress(done, total)
+        if state.result != Result.running:
+            break
+    if done % every == 0:
+        history.append(_repeated(history[-1], (total - done) // every))
+    return state, _joined(history)
+
+
+def from_host(run: Run) -> tuple[State, Any]:
+    """The run step by step: the solver's own programs do the work."""
+    problem, solver, M0, key, total, record, every, progress = run
+    state = solver.init(problem, on_host(M0))
+    history = [_recorded(record, M0)]
+    for done in range(1, total + 1):
+        state = solver.step(problem, state, None if key is None else jax.random.fold_in(key, done - 1))
+        if done % every == 0:
+            history.append(_recorded(record, state.M))
+        if progress is not None:
+            progress(done, total)
+        if state.result is not Result.running:  # known results are the members themselves
+            break
+    history.append(_repeated(history[-1], total // every + 1 - len(history)))
+    return state, _joined(history)
+
+
+def _recorded(record: Record, M: Any) -> Any:
+    value = on_host(M) if record is identity else _compiled_record(record, M)
+    return jax.tree.map(lambda leaf: leaf[None], value)
+
+
+def _repeated(recorded: Any, count: int) -> Any:
+    """What a run that ended early lacks to be as long as under jit."""
+    return jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf)[-1:], count, axis=0), recorded)
+
+
+def _nothing(M: Any) -> Array:
+    return jnp.zeros(())
+
+
+def _joined(history: list[Any]) -> Any:
+    xp, _ = numerics(history)
+    return jax.tree.map(lambda *leaves: xp.concatenate(leaves), *history)

@@ -1,0 +1,104 @@
+"""`pc.solve`: checks, the run, and what is made of its end."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from perfcontrol._checks import check_integer, check_key, fail, is_concrete
+from perfcontrol._programs import on_host
+from perfcontrol.problem import PerformativeProblem
+from perfcontrol.solvers.base import AbstractSolver, Solution, SolveError
+from perfcontrol.solvers.result import Result
+from perfcontrol.solvers.runs import Record, Run, from_host, identity, in_chunks, traced
+
+
+def solve(
+    problem: PerformativeProblem,
+    solver: AbstractSolver,
+    M0: Any = None,
+    *,
+    key: Any = None,
+    max_steps: int | None = None,
+    record: Record | None = None,
+    every: int = 1,
+    throw: bool = True,
+    progress: Callable[[int, int], None] | None = None,
+) -> Solution:
+    """Run a solver on a problem.
+
+    Iteration n draws its randomness from `fold_in(key, n)`, so the same key gives the same run, whatever the chunks.
+    Works under jit and vmap (over keys, starts or stacked problems); then nothing is raised.
+
+    Args:
+        problem: the problem.
+        solver: `RSGD`, `RRM`, `StablePoint`, ...
+        M0: feasible start, free parameters; None: the feasible policy nearest to zero.
+        key: JAX random key; required by solvers that sample.
+        max_steps: overrides the solver's own number of steps.
+        record: M -> any pytree of arrays, run inside the compiled loop and kept as `history`; default M itself.
+        every: record every so many steps.
+        throw: raise SolveError unless the result is `success`.
+        progress: called on the host with (steps done, steps at most) after each compiled chunk.
+
+    Raises:
+        InputError: arguments that do not fit, before any work.
+        SolveError: the run failed and `throw` is True; its `.solution` is what was reached.
+    """
+    if not isinstance(problem, PerformativeProblem):
+        raise fail("problem", type(problem).__name__, "be a PerformativeProblem", "Build it first.")
+    if not isinstance(solver, AbstractSolver):
+        raise fail("solver", type(solver).__name__, "be a solver", "Pass for example pc.StablePoint().")
+    solver.check(problem)
+    key = check_key(key) if solver.needs_key or key is not None else None
+    every = check_integer("every", every, 1)
+    total = solver.max_steps if max_steps is None else check_integer("max_steps", max_steps, 0)
+    M0 = problem.initial_policy() if M0 is None else problem.check_policy("M0", M0)
+    leaves = jax.tree.leaves(eqx.filter((problem, solver, M0, key), eqx.is_array))
+    concrete = all(is_concrete(leaf) for leaf in leaves)
+    if concrete and not bool(problem.feasible_set.contains(M0, _slack(M0))):
+        raise fail(
+            "M0",
+            f"a policy {float(jnp.linalg.norm(M0 - problem.feasible_set.project(M0))):.3g} away",
+            "lie in the feasible set",
+            "Pass problem.feasible_set.project(M0), or leave M0 out.",
+        )
+    run = Run(problem, solver, M0, key, total, identity if record is None else record, every, progress)
+    stopped = max_steps is not None and max_steps < solver.max_steps
+    if not concrete:
+        state, history = traced(run)
+        result, stats = solver.finish(problem, state, stopped)
+        return Solution(state.M, result, state.steps, history, stats)
+    with np.errstate(all="ignore"):  # numbers that are not finite become a named result
+        solution = _finished(run, stopped)
+        rescuer = None if stopped or solution.result == Result.success else solver.rescue(problem)
+        if rescuer is not None:
+            solution = _rescued(solution, _finished(Run(problem, rescuer, M0, key, rescuer.max_steps), False))
+    if throw and solution.result != Result.success:
+        raise SolveError(f"{Result[solution.result]} (step {int(solution.steps)})", solution)
+    return solution
+
+
+def _finished(run: Run, stopped: bool) -> Solution:
+    """The solution of a run whose numbers are known."""
+    state, history = (from_host if run.solver.from_host else in_chunks)(run)
+    state = on_host(state)
+    result, stats = run.solver.finish(run.problem, state, stopped)
+    return Solution(*jax.tree.map(jnp.asarray, (state.M, result, state.steps, history, stats)))
+
+
+def _rescued(failed: Solution, rescue: Solution) -> Solution:
+    """What the rescuer reached where it succeeded, with the history of the failed run; else the failure."""
+    if rescue.result != Result.success:
+        return failed
+    stats = {name: rescue.stats.get(name, value) for name, value in failed.stats.items()}
+    stats["rescued"] = jnp.asarray(True)
+    return Solution(rescue.M, rescue.result, failed.steps + rescue.steps, failed.history, stats)
+
+
+def _slack(M: Array) -> float:
+    return 1e-8 if M.dtype == jnp.float64 else 1e-4
