@@ -1,4 +1,4 @@
-"""`python -m benchmarks [--quick] [--out FILE]`: the table of speeds, everything in one process."""
+"""`python -m benchmarks [--quick] [--out FILE]`: first calls in fresh processes, then speeds in one process."""
 
 import argparse
 import os
@@ -9,13 +9,13 @@ import jax
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
 
-from benchmarks import speed  # noqa: E402 - after JAX is configured
+from benchmarks import first_calls, speed  # noqa: E402 - after JAX is configured
 
-parser = argparse.ArgumentParser(description="Speed of gradients, exact evaluation and stable points.")
+parser = argparse.ArgumentParser(description="First calls; speed of gradients, exact evaluation and stable points.")
 parser.add_argument("--quick", action="store_true", help="the small shapes only")
 parser.add_argument("--out", type=Path, help="also write the table as Markdown")
 arguments = parser.parse_args()
-text = speed.table(arguments.quick)
+text = first_calls.table() + "\n\n" + speed.table(arguments.quick)
 print(text)
 if arguments.out is not None:
     arguments.out.write_text(text + "\n", encoding="utf-8")
