@@ -6,12 +6,14 @@ from typing import Any, NamedTuple
 
 import jax
 from jaxtyping import Array, Key
-from scipy import integrate, stats
 
 from perfcontrol.random_vectors import random_signs
 
 CUTOFF = 3.0  # the Gaussian is cut at this many of its own standard deviations before it is normalised
-_NORMAL_SCALE = float(stats.truncnorm(-CUTOFF, CUTOFF).std())
+_DENSITY_AT_0, _DENSITY_AT_CUTOFF = (math.exp(-(z**2) / 2) / math.sqrt(2 * math.pi) for z in (0.0, CUTOFF))
+_KEPT = math.erf(CUTOFF / math.sqrt(2))  # the probability that is not cut
+_NORMAL_SCALE = math.sqrt(1 - 2 * CUTOFF * _DENSITY_AT_CUTOFF / _KEPT)
+_MEAN_ABSOLUTE = 2 * (_DENSITY_AT_0 - _DENSITY_AT_CUTOFF) / _KEPT
 
 
 class ScalarLaw(NamedTuple):
@@ -30,10 +32,8 @@ def _truncated_gaussian(key: Key[Array, ""], shape: tuple[int, ...], dtype: Any)
     return jax.random.truncated_normal(key, -CUTOFF, CUTOFF, shape, dtype) / _NORMAL_SCALE
 
 
-_mean_absolute_normal = 2 * integrate.quad(lambda z: z * stats.truncnorm.pdf(z, -CUTOFF, CUTOFF), 0, CUTOFF)[0]
-
 SCALAR_LAWS = {
     "rademacher": ScalarLaw(random_signs, 1.0, 1.0),
     "uniform": ScalarLaw(_uniform, math.sqrt(3), math.sqrt(3) / 2),
-    "truncated_gaussian": ScalarLaw(_truncated_gaussian, CUTOFF / _NORMAL_SCALE, _mean_absolute_normal / _NORMAL_SCALE),
+    "truncated_gaussian": ScalarLaw(_truncated_gaussian, CUTOFF / _NORMAL_SCALE, _MEAN_ABSOLUTE / _NORMAL_SCALE),
 }
