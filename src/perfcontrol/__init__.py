@@ -4,6 +4,7 @@ Two policies are told apart everywhere: `M` is evaluated or improved, `deployed`
 """
 
 from perfcontrol import experiments
+from perfcontrol._calls import explain_calls
 from perfcontrol._checks import InputError
 from perfcontrol.costs import AbstractCost, ConvexCost, QuadraticCost
 from perfcontrol.evaluate import (
@@ -179,3 +180,5 @@ __all__ = [
     "strong_stability",
     "theorem_step_size",
 ]
+
+explain_calls(__name__, globals(), __all__)

@@ -1,8 +1,7 @@
 """Input checks with one wording of errors: the argument, what was got, what is required, the remedy."""
 
-import difflib
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -23,16 +22,6 @@ _warned_about_precision = False
 def fail(name: str, got: str, required: str, remedy: str) -> InputError:
     """The error that every check raises: "`name` must ...; got ... Remedy." """
     return InputError(f"`{name}` must {required}; got {got}. {remedy}")
-
-
-def check_keywords(owner: str, given: Iterable[str], known: Sequence[str]) -> None:
-    """Raise where a keyword is none that `owner` takes, with the nearest one that it does."""
-    for name in given:
-        if name not in known:
-            near = difflib.get_close_matches(name, known, 1)
-            hint = f": did you mean `{near[0]}`?" if near else "."
-            required = f"be an argument of {owner}: {', '.join(known) or 'it takes none'}"
-            raise fail(name, "a name that it does not know", required, f"Check the spelling{hint}")
 
 
 def is_concrete(value: Any) -> bool:

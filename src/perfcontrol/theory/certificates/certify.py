@@ -2,7 +2,8 @@
 
 from typing import Any
 
-from perfcontrol._checks import check_keywords, fail
+from perfcontrol._calls import check_keywords
+from perfcontrol._checks import fail
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.theory.certificates.certificate import Certificate
 from perfcontrol.theory.certificates.global_bound import GlobalBound

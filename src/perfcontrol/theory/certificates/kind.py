@@ -1,12 +1,11 @@
 """The interface of a kind of certificate: frozen settings that, given a problem, answer with a `Certificate`."""
 
 import abc
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 
-from perfcontrol._checks import check_keywords
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.theory.assumptions import Assumption, weakest
 from perfcontrol.theory.certificates.certificate import Certificate
@@ -22,10 +21,6 @@ class AbstractCertificateKind(abc.ABC):
 
     name: ClassVar[str]
     title: ClassVar[str]
-
-    def __new__(cls, **settings: Any):  # inferred to be Self, which the run-time checker cannot read
-        check_keywords(f"pc.{cls.__name__}", settings, [field.name for field in fields(cls)])
-        return super().__new__(cls)
 
     @abc.abstractmethod
     def assess(self, problem: PerformativeProblem) -> Certificate:
