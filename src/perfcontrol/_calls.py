@@ -76,12 +76,12 @@ def explain_call(module: str, name: str, value: Any) -> Any:
     wrapped, so that the class stays what it is. What was wrapped before, or is neither, is returned as it is.
     """
     owner = f"{module.replace('perfcontrol', 'pc', 1)}.{name}"
-    if inspect.isfunction(value) and not hasattr(value, "explains"):
-        value = _explained(owner, value, skip=0)
-        value.__module__ = module
-    elif inspect.isclass(value) and not issubclass(value, Exception | eqx.Enumeration):
+    if inspect.isclass(value) and not issubclass(value, Exception | eqx.Enumeration):
         if not hasattr(vars(value).get("__init__"), "explains"):
             value.__init__ = _explained(owner, value.__init__, skip=1, docstring=value.__doc__)
+    elif inspect.isfunction(value) and not hasattr(value, "explains"):
+        value = _explained(owner, value, skip=0)
+        value.__module__ = module
     return value
 
 
