@@ -28,7 +28,7 @@ class TestContinuation(SolverContract):
             assert bool(solution.stats["unique"])
 
 
-def reacting_mean(seed: int, strength: float) -> pc.PerformativeProblem:
+def reacting_mean(seed: int, strength: float, feasible_set=None) -> pc.PerformativeProblem:
     """A mean that reacts so strongly that the best response jumps about on a ball's surface and through it."""
     return pc.PerformativeProblem(
         system=pc.LinearSystem(0.4 * normal(seed, 3, 3), normal(seed + 1, 3, 2)),
@@ -41,7 +41,7 @@ def reacting_mean(seed: int, strength: float) -> pc.PerformativeProblem:
             pc.Affine([0.1], 0.1 * normal(seed + 4, 1, 1, 2, 3)),
             mean=pc.Affine(np.zeros((3, 3)), strength * normal(seed + 5, 3, 3, 1, 2, 3)),
         ),
-        feasible_set=pc.FrobeniusBall(1.0),
+        feasible_set=pc.FrobeniusBall(1.0) if feasible_set is None else feasible_set,
         initial_state=normal(seed + 6, 3),
     )
 
@@ -72,6 +72,19 @@ def test_continuation_satisfies_the_variational_inequality_where_the_mean_reacts
         assert float(stable.stats["residual"]) <= 1e-11 and bool(stable.stats["rescued"]) == (not alone), seed
         lost += not alone
     assert lost > 0, "these problems should be too hard for Newton's method alone"
+
+
+@pytest.mark.parametrize("seed", [12, 18, 48])
+def test_continuation_passes_the_kinks_of_a_box_where_the_curve_turns_sharply(seed):
+    """At 12 and 48 no step along the tangent of the near side meets the curve beyond the kink."""
+    limit = 0.3
+    problem = reacting_mean(seed, 1.5, pc.Box(-limit, limit))
+    solution = pc.solve(problem, SOLVER)
+    assert int(solution.steps) > 100  # many kinks on the way
+    assert 0 < int(jnp.sum(jnp.abs(solution.M) >= limit)) < solution.M.size
+    g = pc.expected_gradient(problem, solution.M)
+    # The variational inequality of a box, entry by entry.
+    assert float(jnp.sum(g * solution.M + limit * jnp.abs(g))) <= 1e-9 * float(jnp.sum(jnp.abs(g)))
 
 
 @pytest.mark.parametrize("sensitivity", [0.9, 1.5, -3.0, -40.0, 0.0])

@@ -40,7 +40,9 @@ class Continuation(AbstractExactSolver):
     """A performatively stable policy by continuation from M_0; for bounded sets, where repeated minimisation fails.
 
     Needs a quadratic cost and known moments, and works with matrices of the policy's size: for up to 2048 free
-    parameters. On an unbounded set there may be no stable policy, or the curve may leave for infinity. `.stats`:
+    parameters. On an unbounded set there may be no stable policy, or the curve may leave for infinity. Where
+    constraints become active or cease to be, the curve has a kink: steps shrink there and turn to the far side's
+    tangent. That they arrive is proved for smooth Φ only; through kinks it is what tests show. `.stats`:
     `residual` (relative natural residual), `unique` (of the best response), `level` (λ reached).
 
     Args:
@@ -87,20 +89,21 @@ class Continuation(AbstractExactSolver):
         enough = xp.where(last, xp.minimum(0.01 * tolerance, 1e3 * eps), xp.sqrt(eps)).astype(size.dtype) * size
 
         def correct(carry: Any) -> Any:
-            y, move, *_, count = carry
+            y, move, _, opening, *_, count = carry
             y = y - move
             gap, slope, unique = _curve(problem, own.anchor, y)
             move = solve(xp.concatenate([slope, border[None]]), xp.append(gap, xp.zeros((), gap.dtype)))
-            return y, move, slope, xp.linalg.norm(gap), unique, count + 1
+            opening = xp.where(count == 0, slope, opening)
+            return y, move, slope, opening, xp.linalg.norm(gap), unique, count + 1
 
         def unfinished(carry: Any) -> Any:
-            _, move, _, gap, _, count = carry
+            _, move, *_, gap, _, count = carry
             return (count == 0) | ((gap > enough) & xp.all(xp.isfinite(move)) & (count < CORRECTIONS))
 
         nothing = xp.zeros((here.size - 1, here.size), here.dtype)
         far = xp.asarray(xp.inf, here.dtype)
-        began = (ahead, xp.zeros_like(here), nothing, far, own.unique, xp.asarray(0))
-        y, _, slope, gap, unique, count = while_loop(unfinished, correct, began)
+        began = (ahead, xp.zeros_like(here), nothing, nothing, far, own.unique, xp.asarray(0))
+        y, _, slope, opening, gap, unique, count = while_loop(unfinished, correct, began)
         M = nearest(problem.feasible_set, y[:-1].reshape(state.M.shape))
         # The corrections at λ = 1 may stop at what rounding allows: there the natural residual decides.
         arrived = cond(last, lambda: residual_of(problem, M, M) <= tolerance, lambda: xp.asarray(False))
@@ -115,10 +118,13 @@ class Continuation(AbstractExactSolver):
         length = xp.where(good, xp.where(first, FIRST * scale, longer), own.length / 2)
         stuck = ~good & (first | (length < SHORTEST * scale))
         ended = choose(arrived | stuck, Result.success, Result.running)  # `finish` tells which by the residual
+        # At a kink the curve may turn so sharply that no step along the old tangent meets it: try that of the far side.
+        far_side, _ = _tangent(opening, border, end)
+        turns = short & ~last & xp.all(xp.isfinite(far_side))
         moved = choose(
             good,
             (M, y[-1], tangent, unique),
-            (state.M, own.level, own.tangent, own.unique),
+            (state.M, own.level, xp.where(turns, far_side, own.tangent), own.unique),
         )
         kept = _Own(moved[1], moved[2], length, scale, own.anchor, moved[3])
         return State(moved[0], state.steps + 1, ended, kept)
