@@ -25,6 +25,13 @@ class TestConvexCost(CostContract):
         return pc.ConvexCost(Soft(jnp.asarray(1.5)))
 
 
+class TestDiscountedConvexCost(CostContract):
+    difference_tolerance = 1e-6
+
+    def cost(self):
+        return pc.ConvexCost(Soft(jnp.asarray(1.5)), discount=0.8)
+
+
 Q, R = random_psd(1, 3), random_psd(2, 2)
 
 
@@ -135,6 +142,7 @@ REFUSED = {
     "integers": (lambda: check(lambda t, x, u: t), "function", "real number"),
     "negative": (lambda: pc.ConvexCost(quadratic_stage, strong_convexity=-1.0), "strong_convexity", "-1.0"),
     "contradiction": (lambda: pc.ConvexCost(quadratic_stage, 2.0, 1.0), "strong_convexity", "smoothness 1.0"),
+    "discount": (lambda: pc.ConvexCost(quadratic_stage, discount=-0.5), "discount", "-0.5", "(0, 1]"),
     "vector of constants": (
         lambda: pc.ConvexCost(quadratic_stage, gradient_bound=[1.0, 2.0]),
         "gradient_bound",

@@ -38,6 +38,11 @@ class TestConstantAndTimeVaryingMixed(SizedCostContract):
         return pc.QuadraticCost(random_psd(2, 3), TIME_VARYING["R"], state_target=TIME_VARYING["state_target"])
 
 
+class TestDiscounted(SizedCostContract):
+    def cost(self):
+        return pc.QuadraticCost(**TIME_VARYING, discount=0.8)
+
+
 @pytest.mark.float32
 def test_quadratic_cost_matches_the_dense_oracle():
     x, u = normal(4, 5, 3), normal(5, 5, 2)
@@ -78,6 +83,9 @@ COSTS_REFUSED = {
         "4",
         "5",
     ),
+    "discount above one": (lambda: pc.QuadraticCost(Q, R, discount=1.1), "discount", "1.1", "(0, 1]"),
+    "discount zero": (lambda: pc.QuadraticCost(Q, R, discount=0.0), "discount", "0.0"),
+    "discounts": (lambda: pc.QuadraticCost(Q, R, discount=[0.9, 0.8]), "discount", "one number"),
     "length": (lambda: check(np.stack([Q] * 4), R), "Q", "(4, 3, 3)", "(5, 3, 3)"),
     "state target": (lambda: check(Q, R, state_target=[1.0, 2.0]), "state_target", "(2,)", "(3,)"),
     "input target": (lambda: check(Q, R, input_target=np.ones((4, 2))), "input_target", "(4, 2)", "(5, 2)"),

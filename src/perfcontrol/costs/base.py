@@ -1,9 +1,13 @@
 """The interface of a stage cost c_t(x, u), summed over t = 0..T."""
 
 import abc
+from typing import Any
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Float
+
+from perfcontrol._checks import as_array, fail, is_concrete
 
 
 class AbstractCost(eqx.Module):
@@ -22,3 +26,18 @@ class AbstractCost(eqx.Module):
     @abc.abstractmethod
     def check(self, state_size: int, input_size: int, horizon: int) -> None:
         """Raise InputError where the cost does not fit a problem of that shape."""
+
+
+def as_discount(value: Any) -> Array | None:
+    """The discount factor as an array; None where it is the number 1, so that nothing is multiplied."""
+    if value is None or (isinstance(value, int | float) and value == 1):
+        return None
+    discount = as_array("discount", value)
+    if discount.ndim or (is_concrete(discount) and not 0 < float(discount) <= 1):
+        raise fail("discount", f"{value}", "be one number in (0, 1]", "Stage t counts discount^t; 1.0: all alike.")
+    return discount
+
+
+def stage_factors(discount: Array, length: int) -> Float[Array, " T1"]:
+    """discount^t for t = 0..length-1."""
+    return discount ** jnp.arange(length, dtype=discount.dtype)

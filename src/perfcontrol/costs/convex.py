@@ -8,11 +8,11 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from perfcontrol._checks import as_array, as_callable, fail, is_concrete
-from perfcontrol.costs.base import AbstractCost
+from perfcontrol.costs.base import AbstractCost, as_discount, stage_factors
 
 
 class ConvexCost(AbstractCost):
-    """c_t(x, u) = function(t, x, u), with gradients by automatic differentiation.
+    """c_t(x, u) = discount^t function(t, x, u), with gradients by automatic differentiation.
 
     Costs are simulated (`simulate`, `estimate_cost`, `sample_gradient`, `RSGD`); what is exact needs a QuadraticCost.
     Convexity and the three constants are the user's word: theory takes them as declared, nothing here checks them.
@@ -23,6 +23,7 @@ class ConvexCost(AbstractCost):
         strong_convexity: μ, jointly in x and u; None for unknown.
         smoothness: ς, the Lipschitz constant of the joint gradient, cross derivatives included; None for unknown.
         gradient_bound: G in ‖∇c_t‖ ≤ G D wherever ‖x‖, ‖u‖ ≤ D; None for unknown.
+        discount: what a stage counts beside the one before it, in (0, 1]; the constants above are without it.
 
     Raises:
         InputError: no function, constants that are negative or contradict each other, or (when the problem is built)
@@ -36,8 +37,17 @@ class ConvexCost(AbstractCost):
     strong_convexity: Array | None
     smoothness: Array | None
     gradient_bound: Array | None
+    discount: Array | None  # None: 1
 
-    def __init__(self, function: Any, strong_convexity: Any = None, smoothness: Any = None, gradient_bound: Any = None):
+    def __init__(
+        self,
+        function: Any,
+        strong_convexity: Any = None,
+        smoothness: Any = None,
+        gradient_bound: Any = None,
+        discount: Any = 1.0,
+    ):
+        self.discount = as_discount(discount)
         self.function = as_callable("function", function)
         self.strong_convexity = _constant("strong_convexity", strong_convexity)
         self.smoothness = _constant("smoothness", smoothness)
@@ -72,10 +82,17 @@ class ConvexCost(AbstractCost):
         return jnp.arange(x.shape[0])
 
     def path_cost(self, x: Array, u: Array) -> Array:
-        return jax.vmap(self.function)(self._times(x), x, u)
+        return self._discounted(jax.vmap(self.function)(self._times(x), x, u))
 
     def path_gradients(self, x: Array, u: Array) -> tuple[Array, Array]:
-        return jax.vmap(jax.grad(self.function, argnums=(1, 2)))(self._times(x), x, u)
+        by_state, by_input = jax.vmap(jax.grad(self.function, argnums=(1, 2)))(self._times(x), x, u)
+        return self._discounted(by_state), self._discounted(by_input)
+
+    def _discounted(self, values: Array) -> Array:
+        if self.discount is None:
+            return values
+        factors = stage_factors(self.discount, len(values)).astype(values.dtype)
+        return factors.reshape(-1, *[1] * (values.ndim - 1)) * values
 
 
 def _constant(name: str, value: Any) -> Array | None:

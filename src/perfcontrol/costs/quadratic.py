@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 
 from perfcontrol._checks import as_array, check_symmetric_psd, check_time_varying, fail
 from perfcontrol._linalg import along_time, transpose
-from perfcontrol.costs.base import AbstractCost
+from perfcontrol.costs.base import AbstractCost, as_discount, stage_factors
 
 
 class QuadraticForm(NamedTuple):
@@ -19,7 +19,7 @@ class QuadraticForm(NamedTuple):
 
 
 class QuadraticCost(AbstractCost):
-    """(x-x*)ᵀQ(x-x*) + (u-u*)ᵀR(u-u*) + 2 (x-x*)ᵀ cross (u-u*).
+    """discount^t [(x-x*)ᵀQ(x-x*) + (u-u*)ᵀR(u-u*) + 2 (x-x*)ᵀ cross (u-u*)].
 
     Args:
         Q: (n, n) or (T+1, n, n).
@@ -27,9 +27,11 @@ class QuadraticCost(AbstractCost):
         cross: (n, m) or (T+1, n, m), or None.
         state_target: x*, (n,) or (T+1, n), or None for zero.
         input_target: u*, (m,) or (T+1, m), or None for zero.
+        discount: what a stage counts beside the one before it, in (0, 1].
 
     Raises:
-        InputError: Q, R or the joint matrix [[Q, cross], [crossᵀ, R]] asymmetric or indefinite.
+        InputError: Q, R or the joint matrix [[Q, cross], [crossᵀ, R]] asymmetric or indefinite; a discount outside
+            (0, 1].
     """
 
     Q: Array
@@ -37,8 +39,18 @@ class QuadraticCost(AbstractCost):
     cross: Array | None
     state_target: Array | None
     input_target: Array | None
+    discount: Array | None  # None: 1
 
-    def __init__(self, Q: Any, R: Any, cross: Any = None, state_target: Any = None, input_target: Any = None):
+    def __init__(
+        self,
+        Q: Any,
+        R: Any,
+        cross: Any = None,
+        state_target: Any = None,
+        input_target: Any = None,
+        discount: Any = 1.0,
+    ):
+        self.discount = as_discount(discount)
         self.Q, self.R = as_array("Q", Q), as_array("R", R)
         self.cross = None if cross is None else as_array("cross", cross)
         self.state_target = None if state_target is None else as_array("state_target", state_target)
@@ -89,11 +101,19 @@ class QuadraticCost(AbstractCost):
             if value is not None:
                 check_time_varying(name, value, inner, labels, length, "T+1")
 
+    def weights(self, horizon: int) -> tuple[Array, Array, Array | None]:
+        """Q, R and cross with the discount folded in; each with a leading axis T+1 where it varies in time."""
+        if self.discount is None:
+            return self.Q, self.R, self.cross
+        factors = stage_factors(self.discount, horizon + 1)[:, None, None]
+        return factors * self.Q, factors * self.R, None if self.cross is None else factors * self.cross
+
     def _joint(self, length: int) -> Array:
         """[[Q, cross], [crossᵀ, R]] for every time."""
         n, m = self.Q.shape[-1], self.R.shape[-1]
-        Q, R = along_time(self.Q, 2, length), along_time(self.R, 2, length)
-        cross = jnp.zeros((length, n, m), Q.dtype) if self.cross is None else along_time(self.cross, 2, length)
+        Q, R, cross = self.weights(length - 1)
+        Q, R = along_time(Q, 2, length), along_time(R, 2, length)
+        cross = jnp.zeros((length, n, m), Q.dtype) if cross is None else along_time(cross, 2, length)
         return jnp.concatenate(
             [jnp.concatenate([Q, cross], axis=-1), jnp.concatenate([transpose(cross), R], axis=-1)], axis=-2
         )
@@ -126,10 +146,11 @@ class QuadraticCost(AbstractCost):
                 return vectors @ weight.T
             return jnp.einsum("tij,tj->ti", weight, vectors)
 
-        by_state, by_input = times(self.Q, x), times(self.R, u)
-        if self.cross is not None:
-            by_state = by_state + times(self.cross, u)
-            by_input = by_input + times(transpose(self.cross), x)
+        Q, R, cross = self.weights(len(x) - 1)
+        by_state, by_input = times(Q, x), times(R, u)
+        if cross is not None:
+            by_state = by_state + times(cross, u)
+            by_input = by_input + times(transpose(cross), x)
         return by_state, by_input
 
     def path_cost(self, x: Array, u: Array) -> Array:

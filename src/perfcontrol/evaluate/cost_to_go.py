@@ -71,7 +71,7 @@ def _stage_weights(problem: PerformativeProblem) -> tuple[Array, Array | None, A
     """
     cost = problem.cost
     assert isinstance(cost, QuadraticCost)
-    Q, R, cross = cost.Q, cost.R, cost.cross
+    Q, R, cross = cost.weights(problem.horizon)
     between = None if cross is None else transpose(cross)
     if not problem.has_gain:
         return Q, between, R

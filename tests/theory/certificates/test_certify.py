@@ -199,6 +199,22 @@ def test_general_costs_need_their_constants_declared_or_estimated():
     assert pc.certify(build(), "sharp").applicable is False
 
 
+def test_certificate_of_a_discounted_quadratic_is_the_same_when_it_is_declared_as_a_function():
+    base = random_problem(3)
+
+    def certificate(cost):
+        parts = {name: getattr(base, name) for name in ("system", "gain", "noise", "perturbation", "feasible_set")}
+        return pc.certify(pc.PerformativeProblem(horizon=5, memory=2, cost=cost, **parts), "rigorous")
+
+    n, m = base.state_size, base.input_size
+    by_weights = certificate(pc.QuadraticCost(1.5 * np.eye(n), 1.5 * np.eye(m), discount=0.8))
+    by_function = certificate(pc.ConvexCost(lambda t, x, u: 1.5 * (x @ x + u @ u), 3.0, 3.0, 3.0, discount=0.8))
+    undiscounted = certificate(pc.QuadraticCost(1.5 * np.eye(n), 1.5 * np.eye(m)))
+    assert by_function.lhs == pytest.approx(by_weights.lhs, rel=1e-12)
+    assert by_weights.lhs < 0.95 * undiscounted.lhs
+    assert by_function.rhs <= by_weights.rhs * (1 + 1e-12)  # weights know more of the curvature than their least one
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [

@@ -8,6 +8,7 @@ import numpy as np
 
 from perfcontrol._checks import fail
 from perfcontrol.costs import QuadraticCost
+from perfcontrol.costs.base import stage_factors
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.theory.assumptions import Assumption, Status
 from perfcontrol.theory.certificates.declarations import COST_CONSTANTS, Declarations
@@ -40,6 +41,9 @@ def cost_constants(
             own = [
                 new if value is None else value for value, new in zip(own, estimated_constants(problem), strict=True)
             ]
+        if (discount := getattr(cost, "discount", None)) is not None:
+            factors = stage_factors(discount, length)
+            own = [None if value is None else factors * value for value in own]
     missing: list[str] = []
     assumptions: list[Assumption] = []
     out = []

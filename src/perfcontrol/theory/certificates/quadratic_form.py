@@ -86,4 +86,5 @@ def simplified(problem: PerformativeProblem) -> PerformativeProblem:
     cost = problem.cost
     assert isinstance(cost, QuadraticCost)
     zero = Constant(jnp.zeros(problem.state_size, problem.dtype))
-    return eqx.tree_at(lambda p: (p.initial_state, p.cost), problem, (zero, QuadraticCost(cost.Q, cost.R, cost.cross)))
+    untargeted = QuadraticCost(cost.Q, cost.R, cost.cross, discount=cost.discount)
+    return eqx.tree_at(lambda p: (p.initial_state, p.cost), problem, (zero, untargeted))
