@@ -6,6 +6,7 @@ from perfcontrol.response.respond import (
     residual,
     residual_of,
     respond,
+    response_hessian,
     response_jacobian,
     response_pushforward,
 )
@@ -16,6 +17,7 @@ __all__ = [
     "residual",
     "residual_of",
     "respond",
+    "response_hessian",
     "response_jacobian",
     "response_pushforward",
 ]

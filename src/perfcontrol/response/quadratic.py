@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array
 
 from perfcontrol._linalg import symmetrise
-from perfcontrol._programs import Numbers, known, on_host, program
+from perfcontrol._programs import Numbers, known, numerics, on_host, program
 from perfcontrol.evaluate.cost_to_go import CostToGo
 from perfcontrol.evaluate.exact import weigh
 from perfcontrol.evaluate.impulses import impulse_form
@@ -59,6 +59,12 @@ class Factors(NamedTuple):
     G_mean: Any
     Sigma: Any
     w: Any
+
+    @property
+    def matrix(self) -> Any:
+        """𝐇, (p, p)."""
+        xp, _ = numerics(self.G, self.Sigma)
+        return 2 * (xp.kron(self.G, self.Sigma) + xp.kron(self.G_mean, xp.outer(self.w, self.w)))
 
     def gradient(self, M: Any) -> Any:
         """The gradient at M."""

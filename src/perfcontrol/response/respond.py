@@ -108,6 +108,11 @@ def respond(problem: PerformativeProblem, deployed: Any, start: Any = None) -> R
     return _respond_in_one_program(*eqx.combine(jax.lax.stop_gradient(arrays), rest))
 
 
+def response_hessian(problem: PerformativeProblem, world: CostToGo) -> Any:
+    """𝐇 = ∂_1 g in a given world, (p, p); where it is held."""
+    return _shape_of_cost(problem, world).matrix
+
+
 def response_jacobian(problem: PerformativeProblem, deployed: Any, response: Any) -> Any:
     """Φ'(deployed), (p, p), given Φ(deployed), by the implicit function theorem; where the Hessian is held."""
     world = world_of(problem, deployed)

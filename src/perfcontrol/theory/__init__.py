@@ -3,6 +3,7 @@
 Host-level: NumPy and SciPy around the exact engine; nothing here promises to work under jit or vmap.
 """
 
+from perfcontrol.evaluate.reaction import reaction_jacobian
 from perfcontrol.theory.assumptions import Assumption
 from perfcontrol.theory.certificates.certificate import Certificate
 from perfcontrol.theory.certificates.certify import KINDS, certify
@@ -12,7 +13,7 @@ from perfcontrol.theory.certificates.paper import Paper
 from perfcontrol.theory.certificates.report import certificate_row, verdict_rows
 from perfcontrol.theory.certificates.rigorous import Rigorous
 from perfcontrol.theory.certificates.sharp import Sharp
-from perfcontrol.theory.derivatives import hessian, reaction_jacobian
+from perfcontrol.theory.derivatives import hessian
 from perfcontrol.theory.existence import Existence, existence
 from perfcontrol.theory.rates.error_bounds import rrm_error_bound, rsgd_error_bound
 from perfcontrol.theory.rates.orders import OrderVerdict, compare_orders, order_by_bound

@@ -6,22 +6,25 @@ derivative of the projection.
 """
 
 import math
-from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from perfcontrol._checks import fail
-from perfcontrol._linalg import along_time
+from perfcontrol._linalg import as_dense
+from perfcontrol._programs import on_host, program
 from perfcontrol.costs import QuadraticCost
-from perfcontrol.evaluate.exact import exact_gradient
+from perfcontrol.evaluate.cost_to_go import CostToGo, cost_to_go, world_of
 from perfcontrol.perturbations import NoPerturbation
 from perfcontrol.problem import PerformativeProblem
-from perfcontrol.random_vectors import AbstractRandomVector
+from perfcontrol.response import response_hessian
+from perfcontrol.response.affine import tangent_space
+from perfcontrol.response.projected import projection_slope
 from perfcontrol.systems import LinearSystem
+from perfcontrol.theory.facts import nearest_to_zero
 
 DENSE_LIMIT = 1500  # free parameters up to which p × p matrices are built
 
@@ -51,62 +54,45 @@ def obstacles(problem: PerformativeProblem) -> list[str]:
     return missing
 
 
-@eqx.filter_jit
-def _columns(problem: PerformativeProblem, M: Array, deployed: Array, which: str) -> Array:
-    def gradient(V: Array) -> Array:
-        pair = (M + V, deployed) if which == "policy" else (M, deployed + V)
-        return exact_gradient(problem, *pair)
-
-    _, push = jax.linearize(gradient, jnp.zeros_like(M))
-    eye = jnp.eye(M.size, dtype=M.dtype).reshape(M.size, *M.shape)
-    return jax.lax.map(push, eye, batch_size=min(16, M.size)).reshape(M.size, M.size)
-
-
-def hessian(problem: PerformativeProblem, deployed: Array) -> np.ndarray:
+def hessian(problem: PerformativeProblem, deployed: Any) -> np.ndarray:
     """𝐇 = ∂_1 g under the deployed policy, (p, p) symmetric."""
-    matrix = np.asarray(_columns(problem, jnp.zeros_like(deployed), deployed, "policy"), dtype=float)
-    return (matrix + matrix.T) / 2
+    return np.asarray(response_hessian(problem, world_of(problem, on_host(deployed))), dtype=float)
 
 
-def reaction_jacobian(problem: PerformativeProblem, M: Array, deployed: Array) -> np.ndarray:
-    """𝐄 = ∂_2 g at (M, deployed), (p, p): how the gradient moves with the deployed policy."""
-    return np.asarray(_columns(problem, M, deployed, "deployed"), dtype=float).T
-
-
-def fixed_noise(problem: PerformativeProblem) -> AbstractRandomVector:
-    """The law of w_t; where it reacts, the one under the initial policy."""
-    return problem.noise_under(problem.structure.lift(problem.initial_policy()))
-
-
-def without_reaction(problem: PerformativeProblem) -> PerformativeProblem:
-    """The problem at Δ_t = E Δ_t: no randomness in the dynamics, and no reaction (for means free of the policy)."""
-    n, m, T = problem.state_size, problem.input_size, problem.horizon
-    mean = problem.perturbation.mean(problem.structure.lift(problem.initial_policy()), T)
-    assert mean is not None
-    A = along_time(problem.system.A, 2, T) + mean[..., :n]
-    B = along_time(problem.system.B, 2, T)
-    if mean.shape[-1] == n + m:
-        B = B + mean[..., n:]
-    return eqx.tree_at(
-        lambda p: (p.system, p.perturbation),
-        problem,
-        (LinearSystem(A, B), NoPerturbation()),
-        is_leaf=lambda x: x is None,
+@program
+def _calm_world(problem: PerformativeProblem, policy: Any) -> CostToGo:
+    """The cost-to-go at Δ_t = E Δ_t under a policy."""
+    n, T = problem.state_size, problem.horizon
+    lifted = problem.structure.lift(policy)
+    A, B = problem.system.A, problem.system.B
+    mean = problem.perturbation.mean_operator(lifted, T)
+    if mean is not None:
+        mean = as_dense(mean)
+        A, B = A + mean[..., :n], B + mean[..., n:] if mean.shape[-1] > n else B
+    return cost_to_go(
+        eqx.tree_at(lambda p: (p.system, p.perturbation), problem, (LinearSystem(A, B), NoPerturbation())), lifted
     )
 
 
-def hessian_without_reaction(problem: PerformativeProblem) -> np.ndarray:
-    """𝐇 at Δ_t = E Δ_t: by Jensen's inequality 𝐇 under every law with that mean is at least as large."""
-    calm = without_reaction(problem)
-    return hessian(calm, calm.initial_policy())
+def hessian_without_reaction(problem: PerformativeProblem, weights: np.ndarray | None = None) -> np.ndarray:
+    """𝐇 at Δ_t = E Δ_t: by Jensen's inequality 𝐇 under every law with that mean is at least as large.
+
+    Of the problem's quadratic cost, or of E Σ weight_t (‖x_t‖² + ‖u_t‖²), weights (T+1,); for means free of the policy.
+    """
+    if weights is not None:
+        dtype, cross = problem.dtype, getattr(problem.cost, "cross", None)
+        scale = weights[0] if np.all(weights == weights[0]) else weights[:, None, None]
+        Q, R = (jnp.asarray(scale * np.eye(size), dtype) for size in (problem.state_size, problem.input_size))
+        # the same arrays as in the problem's own cost, where it has any: then the programs are the same too
+        cost = QuadraticCost(Q, R, None if cross is None else jnp.zeros_like(cross))
+        problem = eqx.tree_at(lambda p: p.cost, problem, cost)
+    world = _calm_world(problem, nearest_to_zero(problem))
+    return np.asarray(response_hessian(problem, world), dtype=float)
 
 
-def projection_derivative(problem: PerformativeProblem, point: Array) -> np.ndarray:
+def projection_derivative(problem: PerformativeProblem, point: Any) -> np.ndarray:
     """The derivative (p, p) of the projection onto the feasible set at `point`."""
-    shape, size = problem.policy_shape, point.size
-    project: Callable[[Array], Array] = problem.feasible_set.project
-    slope = jax.jacfwd(lambda v: project(v.reshape(shape)).reshape(-1))(point.reshape(-1))
-    return np.asarray(slope, dtype=float).reshape(size, size)
+    return np.asarray(projection_slope(problem.feasible_set, on_host(point)), dtype=float)
 
 
 def range_basis(matrix: np.ndarray) -> np.ndarray:
@@ -122,7 +108,7 @@ def tangent_basis(problem: PerformativeProblem) -> np.ndarray:
     """
     size = int(np.prod(problem.policy_shape))
     if problem.feasible_set.affine:
-        return range_basis(projection_derivative(problem, problem.initial_policy()))
+        return range_basis(np.asarray(tangent_space(problem.feasible_set, nearest_to_zero(problem))[1], dtype=float))
     if problem.feasible_set.row_total is not None:
         n = problem.policy_shape[-1]
         centring = np.eye(n) - np.full((n, n), 1 / n)

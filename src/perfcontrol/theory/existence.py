@@ -11,7 +11,6 @@ Two fixed-point arguments (docs: theory, section on existence), neither of which
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import numpy as np
 
 from perfcontrol.costs import QuadraticCost
@@ -19,6 +18,7 @@ from perfcontrol.perturbations import DirectionalPerturbation, NoPerturbation, S
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.theory.assumptions import Assumption, Status, reaction_status, word_of
 from perfcontrol.theory.derivatives import hessian_without_reaction, tangent_basis
+from perfcontrol.theory.facts import facts, in_free_parameters
 
 
 class Existence(NamedTuple):
@@ -31,7 +31,7 @@ class Existence(NamedTuple):
 
 def set_radius(problem: PerformativeProblem) -> float | None:
     """sup ‖M‖_F over the feasible set, free parameters; None if unbounded."""
-    radius = problem.feasible_set.radius(problem.policy_shape)
+    radius = facts(problem).radius
     return None if radius is None else float(radius)
 
 
@@ -40,7 +40,7 @@ def reaction_is_continuous(problem: PerformativeProblem) -> bool:
     law = problem.perturbation
     if problem.noise_reacts:
         return False
-    if problem.sensitivity() is not None:
+    if facts(problem).sensitivity is not None:
         return True
     return not isinstance(law, SampledPerturbation) and type(law).__module__.startswith("perfcontrol.")
 
@@ -99,6 +99,6 @@ def constant_mean(problem: PerformativeProblem) -> bool:
     derivative = None if mean_map is None else mean_map.derivative()
     if derivative is None or not eqx.tree_at(lambda law: law.mean_map, law, None).policy_free_mean(problem.lifted_set):
         return False
-    slopes = derivative.reshape(-1, *problem.lifted_shape)
-    free = np.asarray(jax.vmap(problem.structure.adjoint)(slopes)).reshape(slopes.shape[0], -1)
-    return bool(np.max(np.abs(free @ tangent_basis(problem)), initial=0.0) <= 1e-12 * (1 + np.max(np.abs(free))))
+    slopes = in_free_parameters(problem, derivative).astype(float)
+    along_set = np.abs(slopes @ tangent_basis(problem))
+    return bool(np.max(along_set, initial=0.0) <= 1e-12 * (1 + np.max(np.abs(slopes))))

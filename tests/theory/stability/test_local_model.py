@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import perfcontrol as pc
-from perfcontrol.theory.derivatives import hessian, reaction_jacobian
+from perfcontrol.theory import hessian, reaction_jacobian
 from perfcontrol.theory.stability.local_model import local_model
 from tests.theory.problems import random_problem
 

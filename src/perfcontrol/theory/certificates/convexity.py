@@ -9,15 +9,14 @@ Four lower bounds of the Hessian (proofs in docs: theory); the largest that appl
   stage weight, seen through u = v - Kx, in place of μ/(1+‖K‖²).
 """
 
-import equinox as eqx
 import numpy as np
 
-from perfcontrol._linalg import along_time
 from perfcontrol.costs import QuadraticCost
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.theory.certificates.ingredients import Ingredients
-from perfcontrol.theory.derivatives import fixed_noise, hessian, tangent_basis, without_reaction
+from perfcontrol.theory.derivatives import hessian_without_reaction, tangent_basis
 from perfcontrol.theory.existence import constant_mean
+from perfcontrol.theory.facts import facts
 
 
 def printed_convexity(items: Ingredients, kappa: float, gamma: float) -> float:
@@ -29,8 +28,7 @@ def printed_convexity(items: Ingredients, kappa: float, gamma: float) -> float:
 def rigorous_convexity(problem: PerformativeProblem, items: Ingredients) -> tuple[float, str]:
     """The best proved lower bound of the Hessian on the feasible set, and which one it is."""
     bounds = {"feedforward": _feedforward(problem, items)}
-    mean = problem.perturbation.mean(problem.structure.lift(problem.initial_policy()), problem.horizon)
-    if mean is not None and constant_mean(problem):
+    if facts(problem).perturbation_mean is not None and constant_mean(problem):
         if np.all(np.isfinite(items.strong_convexity)):
             bounds["jensen"] = _jensen(problem, items.strong_convexity / 2)
         if isinstance(problem.cost, QuadraticCost):
@@ -41,28 +39,24 @@ def rigorous_convexity(problem: PerformativeProblem, items: Ingredients) -> tupl
 
 def _jensen(problem: PerformativeProblem, weights: np.ndarray | None) -> float:
     """λ_min of the Hessian at Δ = E Δ along the set: of E Σ weight_t (‖x‖²+‖u‖²), or of the quadratic cost itself."""
-    calm = without_reaction(problem)
-    if weights is not None:
-        scale = weights[:, None, None]
-        cost = QuadraticCost(scale * np.eye(problem.state_size), scale * np.eye(problem.input_size))
-        calm = eqx.tree_at(lambda p: p.cost, calm, cost)
     basis = tangent_basis(problem)
     if basis.shape[1] == 0:
         return np.inf
-    values = np.linalg.eigvalsh(basis.T @ hessian(calm, calm.initial_policy()) @ basis)
+    values = np.linalg.eigvalsh(basis.T @ hessian_without_reaction(problem, weights) @ basis)
     return max(float(values[0]) - 1e-12 * abs(float(values[-1])), 0.0)
 
 
 def _feedforward(problem: PerformativeProblem, items: Ingredients) -> float:
     """The bound that looks at the feedforward v_t alone, whatever the state does."""
     n, m, T, H = problem.state_size, problem.input_size, problem.horizon, problem.memory
-    gains = np.asarray(problem.gains(), dtype=float)
+    K, known = np.asarray(problem.gain, dtype=float), facts(problem)
+    gains = np.broadcast_to(K, (T + 1, m, n))
     norms = np.linalg.norm(gains, ord=2, axis=(-2, -1))
-    covariances = np.asarray(along_time(fixed_noise(problem).covariance, 2, T), dtype=float)
+    covariances = np.broadcast_to(np.asarray(known.noise_covariance, dtype=float), (T, n, n))
     floors = np.maximum(np.linalg.eigvalsh(covariances)[:, 0], 0)
     stage = [np.eye(m) * mu / (1 + k**2) for mu, k in zip(items.strong_convexity, norms, strict=True)]
-    if isinstance(problem.cost, QuadraticCost):
-        weights = 2 * np.asarray(problem.cost.form(T).matrix, dtype=float)
+    if known.stage_matrix is not None:
+        weights = 2 * known.stage_matrix.astype(float)
         for t in range(T + 1):
             seen = np.block([[np.eye(n), np.zeros((n, m))], [-gains[t], np.eye(m)]])
             W = seen.T @ weights[t] @ seen

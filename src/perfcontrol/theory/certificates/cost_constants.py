@@ -12,6 +12,7 @@ from perfcontrol.costs.base import stage_factors
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.theory.assumptions import Assumption, Status
 from perfcontrol.theory.certificates.declarations import COST_CONSTANTS, Declarations
+from perfcontrol.theory.facts import facts
 
 
 class CostConstants(NamedTuple):
@@ -75,8 +76,8 @@ def quadratic_constants(problem: PerformativeProblem) -> tuple[np.ndarray, np.nd
     """μ_t, ς_t, G_t and the gradient offset of a quadratic cost, each (T+1,)."""
     assert isinstance(problem.cost, QuadraticCost)
     n = problem.state_size
-    form = problem.cost.form(problem.horizon)
-    matrix, linear = np.asarray(form.matrix, dtype=float), np.asarray(form.linear, dtype=float)
+    known = facts(problem)
+    matrix, linear = known.stage_matrix.astype(float), known.stage_linear.astype(float)
     values = np.linalg.eigvalsh(matrix)
     cross = spectral_norms(matrix[:, :n, n:])
     own = np.maximum(spectral_norms(matrix[:, :n, :n]), spectral_norms(matrix[:, n:, n:]))

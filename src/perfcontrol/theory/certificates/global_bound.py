@@ -15,7 +15,6 @@ References: docs, theory, "The global certificate".
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 import scipy.optimize
@@ -26,7 +25,7 @@ from perfcontrol.theory.assumptions import Assumption, word_of
 from perfcontrol.theory.certificates.certificate import Certificate
 from perfcontrol.theory.certificates.ingredients import FIXED_NOISE
 from perfcontrol.theory.certificates.kind import AbstractCertificateKind
-from perfcontrol.theory.certificates.quadratic_form import form_at, form_derivative, least_cost, simplified
+from perfcontrol.theory.certificates.quadratic_form import expansion, expansions, simplified
 from perfcontrol.theory.certificates.scale_range import ScaleRange, scale_range
 from perfcontrol.theory.derivatives import obstacles, tangent_basis
 from perfcontrol.theory.existence import constant_mean, existence
@@ -82,15 +81,13 @@ def _missing(problem: PerformativeProblem) -> list[str]:
 def _modulus(problem: PerformativeProblem, ranges: ScaleRange) -> tuple[float, dict[str, Any], str]:
     """√(ϱ h), the metric N as a matrix G with its basis, and a remark."""
     problem = simplified(problem)
-    dtype = problem.dtype
     basis = tangent_basis(problem)
     if basis.shape[1] == 0:
         return 0.0, {}, "The set is a single policy."
     low = np.where((ranges.low <= 0) & (ranges.high >= 0), 0.0, np.minimum(ranges.low**2, ranges.high**2))
     largest = np.maximum(np.abs(ranges.low), np.abs(ranges.high))
     high = largest**2
-    Z = jnp.asarray(basis, dtype)
-    form = np.asarray(form_at(problem, Z, jnp.asarray(low, dtype)), dtype=float)
+    form = expansion(problem, low).form(basis)
     G = form[1:, 1:]
     floor = float(np.linalg.eigvalsh(G)[0])
     if floor <= 1e-12 * float(np.linalg.norm(G, 2)):
@@ -101,14 +98,13 @@ def _modulus(problem: PerformativeProblem, ranges: ScaleRange) -> tuple[float, d
         reduced = ranges.slopes.reshape(-1, ranges.slopes.shape[-1]) @ basis
         whitened = scipy.linalg.solve_triangular(np.linalg.cholesky(G), reduced.T, lower=True)
         lipschitz = np.linalg.norm(whitened, axis=0).reshape(largest.shape)
-    along = jnp.asarray(2 * largest * lipschitz, dtype)
-    L = np.asarray(form_derivative(problem, Z, jnp.asarray(high, dtype), along), dtype=float)
+    at_high, derivative = expansions(problem, high, 2 * largest * lipschitz)
+    L = derivative.form(basis)
     values: dict[str, Any] = {"metric": G, "basis": basis}
     if float(np.abs(L[1:, :]).max()) == 0:
         return 0.0, values, "The reaction does not move the best response."
-    level = float(least_cost(problem, jnp.asarray(high, dtype)))
     stretch = float(scipy.linalg.eigh(L[1:, 1:], G, eigvals_only=True)[-1])
-    height = largest_on_sublevel((L + L.T) / 2, form, level)
+    height = largest_on_sublevel(L, form, at_high.least(problem))
     return float(np.sqrt(max(stretch, 0.0) * max(height, 0.0))), values, ""
 
 

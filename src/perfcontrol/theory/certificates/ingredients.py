@@ -5,13 +5,12 @@ from typing import Any
 
 import numpy as np
 
-from perfcontrol._linalg import along_time
 from perfcontrol.perturbations import SampledPerturbation
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.theory.assumptions import Assumption, word_of
 from perfcontrol.theory.certificates.cost_constants import cost_constants, spectral_norms
 from perfcontrol.theory.certificates.declarations import SERIES, Declarations
-from perfcontrol.theory.derivatives import fixed_noise
+from perfcontrol.theory.facts import facts
 from perfcontrol.theory.stability.strong_stability import check_per_step
 
 FROM_NORMS = Assumption("the constants follow from norms of the problem's matrices and laws", "proved")
@@ -59,7 +58,7 @@ def gather(problem: PerformativeProblem, declared: Declarations | None = None) -
     """
     declared = declared or Declarations()
     T = problem.horizon
-    noise = fixed_noise(problem)
+    read = facts(problem)
     missing: list[str] = [FIXED_NOISE] if problem.noise_reacts else []
     assumptions: list[Assumption] = []
 
@@ -80,19 +79,18 @@ def gather(problem: PerformativeProblem, declared: Declarations | None = None) -
         value = known(name, *others)
         return np.full(T, np.nan) if value is np.nan else check_per_step(name, value, T)
 
-    radius = problem.feasible_set.radius(problem.policy_shape)
-    lifted = None if radius is None else problem.structure.norm * float(radius)
-    floor, quiet_direction = _quietest(np.asarray(noise.covariance, dtype=float))
+    lifted = None if read.radius is None else problem.structure.norm * float(read.radius)
+    floor, quiet_direction = _quietest(read.noise_covariance.astype(float))
     constants, cost_missing, cost_assumptions = cost_constants(problem, declared)
     initial_bound = known(
         "initial_bound",
-        problem.initial_state.bound,
+        read.initial_bound,
         "the bound of the initial state",
         "a law that has one, such as initial_state=pc.Uniform(low, high)",
     )
     noise_bound = known(
         "noise_bound",
-        noise.bound,
+        read.noise_bound,
         "the bound W of the noise",
         "a law that has one, such as noise=pc.Uniform(low, high)",
     )
@@ -104,13 +102,13 @@ def gather(problem: PerformativeProblem, declared: Declarations | None = None) -
     )
     perturbation_bound = series(
         "perturbation_bound",
-        problem.perturbation_bound(),
+        read.perturbation_bound,
         "the almost-sure bound of the perturbations",
         "scales that know theirs on a bounded set, such as pc.Affine(offset, slope)",
     )
     sensitivity = series(
         "sensitivity",
-        problem.sensitivity(),
+        read.sensitivity,
         "the sensitivity of the perturbation law",
         "maps that know theirs, such as pc.Affine(offset, slope); pc.estimate_sensitivity(problem, key=key) samples it",
     )
@@ -131,7 +129,7 @@ def gather(problem: PerformativeProblem, declared: Declarations | None = None) -
         gradient_offset=constants.gradient_offset,
         noise_floor=floor,
         quiet_direction=quiet_direction,
-        noise_mean=float(np.max(np.linalg.norm(np.asarray(along_time(noise.mean, 1, T)), axis=-1))),
+        noise_mean=float(np.max(np.linalg.norm(read.noise_mean, axis=-1))),
         structure_norm=problem.structure.norm,
         missing=(*missing, *cost_missing),
         assumptions=(*assumptions, *cost_assumptions, *word_of(problem)),

@@ -14,8 +14,8 @@ from perfcontrol.theory.certificates.convexity import printed_convexity
 from perfcontrol.theory.certificates.declarations import Declarations
 from perfcontrol.theory.certificates.ingredients import FROM_NORMS, Ingredients, gather
 from perfcontrol.theory.certificates.kind import AbstractCertificateKind
-from perfcontrol.theory.derivatives import fixed_noise
 from perfcontrol.theory.existence import constant_mean, existence
+from perfcontrol.theory.facts import facts
 from perfcontrol.theory.stability.strong_stability import StrongStability, candidates
 
 SHRINKING = (1.0, 0.9, 0.75, 0.5, 0.25, 0.1)  # a smaller γ is valid too, and 1/(1-γ) may like it
@@ -96,19 +96,19 @@ def assumptions_missing(problem: PerformativeProblem, items: Ingredients) -> lis
     missing = list(items.missing)
     if items.noise_mean > 1e-9 * max(1.0, items.noise_bound):
         missing.append("the noise has a mean (assumption A1): pass one without, such as noise=pc.Uniform(-1.0, 1.0)")
-    if fixed_noise(problem).covariance.ndim == 3:
+    known = facts(problem)
+    if known.noise_covariance.ndim == 3:
         missing.append(
             "the noise is not identically distributed (assumption A1): pass one law, noise=pc.Uniform(low, high)"
         )
     if problem.perturbation.columns(problem.state_size, problem.input_size) > problem.state_size:
         missing.append("the perturbations act on the input (assumption A2): pass directions of shape (k, n, n)")
-    mean = problem.perturbation.mean(problem.structure.lift(problem.initial_policy()), problem.horizon)
-    if mean is None:
+    if known.perturbation_mean is None:
         missing.append(
             "the mean of the perturbations is not known (assumption A2): "
             "pass a family that knows it, such as pc.DirectionalPerturbation(directions, scale)"
         )
-    elif not constant_mean(problem) or float(np.abs(np.asarray(mean)).max()) > 0:
+    elif not constant_mean(problem) or np.any(known.perturbation_mean):
         missing.append("the perturbations have a mean (assumption A2): pass mean=None and put a constant one into A")
     if problem.system.horizon is not None or problem.gain.ndim == 3:
         missing.append("the system or its gain varies in time: pass A of shape (n, n) and gain of shape (m, n)")

@@ -1,20 +1,27 @@
 """The cost as a quadratic form 𝔾(θ) of the policy at given variances θ of fixed directions, and its derivative in θ."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
+from perfcontrol._linalg import Matrix
+from perfcontrol._programs import program
 from perfcontrol.costs import QuadraticCost
-from perfcontrol.evaluate.exact import exact_cost, exact_gradient
+from perfcontrol.evaluate.cost_to_go import CostToGo, cost_to_go
+from perfcontrol.evaluate.exact import weigh
 from perfcontrol.perturbations import AbstractPerturbation, CovarianceOperator, DirectionalPerturbation, Draws
 from perfcontrol.perturbations.directional import DirectionalCovariance
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.random_vectors import Constant
-from perfcontrol.response import respond
-from perfcontrol.theory.derivatives import fixed_noise
+from perfcontrol.response import response_hessian
+from perfcontrol.response.affine import Affine
+from perfcontrol.response.projected import Projected
+from perfcontrol.response.quadratic import Quadratic
+from perfcontrol.theory.facts import facts, nearest_to_zero
 
 
 class _GivenVariances(AbstractPerturbation):
@@ -22,7 +29,7 @@ class _GivenVariances(AbstractPerturbation):
 
     directions: Array
     variances: Array
-    mean_value: Array
+    mean_value: Matrix | None  # None for zero
 
     def columns(self, state_size: int, input_size: int) -> int:
         return self.directions.shape[-1]
@@ -31,6 +38,9 @@ class _GivenVariances(AbstractPerturbation):
         raise NotImplementedError
 
     def mean(self, M: Array, horizon: int) -> Array:
+        raise NotImplementedError
+
+    def mean_operator(self, M: Array, horizon: int) -> Matrix | None:
         return self.mean_value
 
     def covariance(self, M: Array, horizon: int) -> CovarianceOperator:
@@ -43,45 +53,77 @@ class _GivenVariances(AbstractPerturbation):
         return None
 
 
-def _with_variances(problem: PerformativeProblem, variances: Array) -> PerformativeProblem:
-    law = problem.perturbation
+class Expansion(NamedTuple):
+    """C(M) = cost + <gradient, M - base> + <M - base, hessian (M - base)>/2 in the free parameters."""
+
+    cost: Any
+    gradient: Any  # (p,)
+    hessian: Any  # (p, p)
+
+    def form(self, basis: np.ndarray) -> np.ndarray:
+        """𝔾, (1+q, 1+q): the cost as [1; y]ᵀ𝔾[1; y] at the policies base + basis y."""
+        half = basis.T @ self.gradient / 2
+        curvature = basis.T @ self.hessian @ basis / 2
+        return np.block([[np.reshape(self.cost, (1, 1)), half[None]], [half[:, None], (curvature + curvature.T) / 2]])
+
+    def least(self, problem: PerformativeProblem) -> float:
+        """The smallest value on the feasible set."""
+        base, step = nearest_to_zero(problem), 1 / np.linalg.norm(self.hessian, 2)
+        linear = (self.gradient - self.hessian @ base.reshape(-1)).reshape(base.shape)
+        method = Affine if problem.feasible_set.affine else Projected
+        M, _ = method(problem.feasible_set, Quadratic(linear, step, self.hessian)).minimise(base)
+        moved = (M - base).reshape(-1)
+        return float(self.cost + self.gradient @ moved + moved @ self.hessian @ moved / 2)
+
+
+@program
+def _worlds(problem: PerformativeProblem, base: Any, variances: Any, along: Any) -> tuple[CostToGo, CostToGo]:
+    """The cost-to-go at given variances, and its derivative in them, with everything else as it is."""
+    law, lifted = problem.perturbation, problem.structure.lift(base)
     assert isinstance(law, DirectionalPerturbation)
-    mean = law.mean(problem.structure.lift(problem.initial_policy()), problem.horizon)
-    return eqx.tree_at(lambda p: p.perturbation, problem, _GivenVariances(law.directions, variances, mean))
+    mean = law.mean_operator(lifted, problem.horizon)
+
+    def at(variances: Array) -> CostToGo:
+        fixed = _GivenVariances(law.directions, variances, mean)
+        return cost_to_go(eqx.tree_at(lambda p: p.perturbation, problem, fixed), lifted)
+
+    world, derivative = jax.jvp(at, (variances,), (along,))
+    kept = (world.F, world.B, world.noise_mean, world.noise_covariance)
+    return world, eqx.tree_at(lambda w: (w.F, w.B, w.noise_mean, w.noise_covariance), derivative, kept)
 
 
-@eqx.filter_jit
-def form_at(problem: PerformativeProblem, basis: Array, variances: Array) -> Array:
-    """𝔾(θ): the cost as [1; y]ᵀ𝔾[1; y] at the policies base + basis y, (1+q, 1+q)."""
-    given = _with_variances(problem, variances)
-    base = problem.initial_policy()
-    gradient = exact_gradient(given, base, base).reshape(-1)
-
-    def column(direction: Array) -> Array:
-        return exact_gradient(given, base + direction.reshape(base.shape), base).reshape(-1) - gradient
-
-    curvature = basis.T @ jax.lax.map(column, basis.T, batch_size=16).T
-    half = basis.T @ gradient / 2
-    top = jnp.concatenate([exact_cost(given, base, base)[None], half])
-    return jnp.concatenate([top[None], jnp.concatenate([half[:, None], (curvature + curvature.T) / 4], axis=1)])
+def _expand(problem: PerformativeProblem, base: np.ndarray, world: CostToGo) -> Expansion:
+    cost, gradient = weigh(problem, world, base)
+    return Expansion(cost, gradient.reshape(-1), response_hessian(problem, world))
 
 
-@eqx.filter_jit
-def form_derivative(problem: PerformativeProblem, basis: Array, variances: Array, along: Array) -> Array:
-    """d𝔾(θ)/dθ along a direction, (1+q, 1+q)."""
-    return jax.jvp(lambda theta: form_at(problem, basis, theta), (variances,), (along,))[1]
+def expansion(problem: PerformativeProblem, variances: np.ndarray) -> Expansion:
+    """The cost about the policy nearest to zero at given variances (T, k)."""
+    base, theta = nearest_to_zero(problem), variances.astype(problem.dtype)
+    return _expand(problem, base, _worlds(problem, base, theta, np.zeros_like(theta))[0])
 
 
-@eqx.filter_jit
-def least_cost(problem: PerformativeProblem, variances: Array) -> Array:
-    """The smallest cost on the set at given variances."""
-    given, start = _with_variances(problem, variances), problem.initial_policy()
-    return exact_cost(given, respond(given, start).M, start)
+def expansions(problem: PerformativeProblem, variances: np.ndarray, along: np.ndarray) -> tuple[Expansion, Expansion]:
+    """The same, and its derivative in the variances along (T, k).
+
+    Given the mean dynamics, an expansion is affine in the cost-to-go Λ and in the weights R and N: its derivative is
+    the expansion of their derivatives, less that of zeros.
+    """
+    base, dtype = nearest_to_zero(problem), problem.dtype
+    world, derivative = _worlds(problem, base, variances.astype(dtype), along.astype(dtype))
+    zeros = eqx.tree_at(
+        lambda w: (w.Lambda, w.R, w.N, w.S, w.D),
+        derivative,
+        replace_fn=lambda leaf: None if leaf is None else np.zeros_like(leaf),
+        is_leaf=lambda leaf: leaf is None,
+    )
+    slope, rest = _expand(problem, base, derivative), _expand(problem, base, zeros)
+    return _expand(problem, base, world), Expansion(*(one - other for one, other in zip(slope, rest, strict=True)))
 
 
 def simplified(problem: PerformativeProblem) -> PerformativeProblem:
     """Without what does not enter the gradient for zero-mean noise: the initial state and the targets."""
-    if float(jnp.max(jnp.abs(fixed_noise(problem).mean))) > 0:
+    if facts(problem).noise_has_mean:
         return problem
     cost = problem.cost
     assert isinstance(cost, QuadraticCost)

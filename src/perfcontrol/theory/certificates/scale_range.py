@@ -2,12 +2,12 @@
 
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
 from perfcontrol._checks import as_array, fail
 from perfcontrol.perturbations import DirectionalPerturbation
 from perfcontrol.problem import PerformativeProblem
+from perfcontrol.theory.facts import in_free_parameters, read
 
 DECLARE = "declare (low, high, Lipschitz constant) over the set by scale_range=(0.0, 1.0, 0.5)"
 GENERAL = f"the scales are a general function: pass scale=pc.Affine(offset, slope) if they are affine, or {DECLARE}"
@@ -25,6 +25,14 @@ class ScaleRange(NamedTuple):
     high: np.ndarray
     slopes: np.ndarray | None
     lipschitz: np.ndarray
+
+
+@read
+def _known(problem: PerformativeProblem) -> tuple[Any, Any, Any]:
+    """Range, Lipschitz constants and derivative of the scales, each None where the map does not know it."""
+    law = problem.perturbation
+    assert isinstance(law, DirectionalPerturbation)
+    return law.scale.range(problem.lifted_set), law.scale.lipschitz(problem.lifted_set), law.scale.derivative()
 
 
 def scale_range(problem: PerformativeProblem, declared: Any = None) -> ScaleRange | str:
@@ -48,14 +56,12 @@ def scale_range(problem: PerformativeProblem, declared: Any = None) -> ScaleRang
         if np.any(low > high) or np.any(lipschitz < 0):
             raise fail("scale_range", "low > high or a negative Lipschitz constant", "be ordered", "Check the order.")
         return ScaleRange(low, high, None, lipschitz)
-    bounds, lipschitz = law.scale.range(problem.lifted_set), law.scale.lipschitz(problem.lifted_set)
+    bounds, lipschitz, derivative = _known(problem)
     if bounds is None or lipschitz is None:
         return UNBOUNDED if law.scale.continuous else GENERAL
     low, high = full(bounds[0]), full(bounds[1])
-    derivative = law.scale.derivative()
     if derivative is None:
         return ScaleRange(low, high, None, full(lipschitz) * problem.structure.norm)
-    slopes = jax.vmap(problem.structure.adjoint)(derivative.reshape(-1, *problem.lifted_shape))
-    slopes = np.asarray(slopes, dtype=float).reshape(*derivative.shape[:-3], -1)
+    slopes = in_free_parameters(problem, derivative).astype(float)
     slopes = np.broadcast_to(slopes, (*shape, slopes.shape[-1]))
     return ScaleRange(low, high, slopes, np.linalg.norm(slopes, axis=-1))

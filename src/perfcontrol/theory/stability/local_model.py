@@ -7,19 +7,14 @@ step, and that of the stochastic method in mean square, are in `mean_square`.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Array
 
-from perfcontrol.evaluate.exact import expected_gradient
+from perfcontrol.evaluate.exact import exact_gradient
+from perfcontrol.evaluate.reaction import reaction_jacobian
 from perfcontrol.problem import PerformativeProblem
-from perfcontrol.theory.derivatives import (
-    hessian,
-    projection_derivative,
-    range_basis,
-    reaction_jacobian,
-)
+from perfcontrol.theory.derivatives import hessian, projection_derivative, range_basis
 from perfcontrol.theory.stability.mean_square import mean_field_threshold
 
 
@@ -30,17 +25,18 @@ class LocalModel(NamedTuple):
     derivative of the projection on the tangent space, or None where that is the identity (flat constraints).
     """
 
-    M: Array
+    M: np.ndarray
     response_jacobian: np.ndarray
     drift: np.ndarray
     basis: np.ndarray
     damping: Callable[[float], np.ndarray] | None
 
 
-def local_model(problem: PerformativeProblem, M: Array) -> LocalModel:
+def local_model(problem: PerformativeProblem, M: Any) -> LocalModel:
     """The model at a stable policy M (free parameters)."""
-    H, E = hessian(problem, M), reaction_jacobian(problem, M, M)
-    gradient = expected_gradient(problem, M)
+    M = np.asarray(M)
+    H, E = hessian(problem, M), reaction_jacobian(problem, M, M).astype(float)
+    gradient = np.asarray(exact_gradient(problem, M, M), dtype=float)
     small = 0.1 / max(float(np.linalg.norm(H, 2)), np.finfo(float).tiny)
     slope = projection_derivative(problem, M - small * gradient)
     basis = range_basis(slope)

@@ -19,11 +19,10 @@ from typing import Any
 import jax
 import numpy as np
 import scipy.linalg
-from jaxtyping import Array
 
 from perfcontrol._checks import check_integer, fail
 from perfcontrol.problem import PerformativeProblem
-from perfcontrol.theory.stability.sampled_jacobian import JacobianSamples, sample_gradients
+from perfcontrol.theory.stability.sampled_jacobian import sample_jacobians
 
 DEFAULT_SEED = 20241
 Map = Callable[[np.ndarray], np.ndarray]
@@ -137,7 +136,7 @@ def mean_field_threshold(drift: np.ndarray) -> float:
 
 def stability_at(
     problem: PerformativeProblem,
-    M: Array,
+    M: Any,
     drift: np.ndarray,
     basis: np.ndarray,
     *,
@@ -157,10 +156,8 @@ def stability_at(
     """
     batch, samples = check_integer("batch", batch, 1), check_integer("samples", samples, 8)
     key = jax.random.key(DEFAULT_SEED) if key is None else key
-    first_key, second_key, gradient_key = jax.random.split(key, 3)
-    halves = [JacobianSamples(problem, M, basis, k, samples // 2) for k in (first_key, second_key)]
-    gradients = np.asarray(sample_gradients(problem, M, jax.random.split(gradient_key, 4 * samples)), dtype=float)
-    covariance = np.atleast_2d(np.cov(gradients @ basis, rowvar=False))
+    halves, gradients = sample_jacobians(problem, M, basis, key, samples)
+    covariance = np.atleast_2d(np.cov(gradients, rowvar=False))
     mean_threshold = mean_field_threshold(drift) if mean_threshold is None else mean_threshold
 
     def joined(X: np.ndarray) -> np.ndarray:
@@ -177,10 +174,10 @@ def stability_at(
     radii = []
     for fitted, fresh in (halves, halves[::-1]):
 
-        def forward(X: np.ndarray, fitted: JacobianSamples = fitted) -> np.ndarray:
+        def forward(X: np.ndarray, fitted: Any = fitted) -> np.ndarray:
             return _lyapunov(drift, _batched(fitted.mean_square(X), drift @ X @ drift.T, batch))
 
-        def backward(Y: np.ndarray, fitted: JacobianSamples = fitted) -> np.ndarray:
+        def backward(Y: np.ndarray, fitted: Any = fitted) -> np.ndarray:
             L = _lyapunov(drift.T, Y)
             return _batched(fitted.adjoint(L), drift.T @ L @ drift, batch)
 

@@ -1,15 +1,18 @@
 """Finding a stable policy by exact solvers, and proving that there is none where its equation is affine."""
 
-import jax
-import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array
+from collections.abc import Iterator
 
-from perfcontrol.evaluate.exact import expected_gradient
+import jax
+import numpy as np
+
+from perfcontrol.evaluate.exact import exact_gradient
+from perfcontrol.evaluate.reaction import reaction_jacobian
 from perfcontrol.problem import PerformativeProblem
+from perfcontrol.response.projected import nearest
 from perfcontrol.solvers import AbstractSolver, Continuation, Result, Solution, StablePoint, solve
-from perfcontrol.theory.derivatives import hessian, reaction_jacobian, tangent_basis
+from perfcontrol.theory.derivatives import hessian, tangent_basis
 from perfcontrol.theory.existence import set_radius
+from perfcontrol.theory.facts import nearest_to_zero
 
 CONTINUED = 256  # free parameters up to which a stable policy is also looked for by continuation
 AFFINE_TOLERANCE = 1e-9
@@ -17,32 +20,34 @@ AFFINE_TOLERANCE = 1e-9
 
 def find_stable_policy(problem: PerformativeProblem, starts: int = 3) -> Solution:
     """The exact solver from the policy nearest to zero, then from random ones; on a bounded set then continuation."""
-    draws = jax.random.normal(jax.random.key(1), (starts - 1, *problem.policy_shape), problem.dtype)
-    centre, project = problem.initial_policy(), problem.feasible_set.project
-    attempts: list[tuple[AbstractSolver, Array]] = [(StablePoint(), centre)]
-    attempts += [(StablePoint(), project(centre + draw)) for draw in draws]
+    first = None
+    for solver, start in _attempts(problem, starts):
+        solution = solve(problem, solver, start, throw=False)
+        if solution.result == Result.success:
+            return solution
+        first = first or solution
+    assert first is not None
+    return first
+
+
+def _attempts(problem: PerformativeProblem, starts: int) -> Iterator[tuple[AbstractSolver, np.ndarray]]:
+    centre = nearest_to_zero(problem)
+    yield StablePoint(), centre
+    for draw in jax.random.normal(jax.random.key(1), (starts - 1, *centre.shape), centre.dtype):
+        yield StablePoint(), nearest(problem.feasible_set, centre + np.asarray(draw))
     if set_radius(problem) is not None and centre.size <= CONTINUED:
-        attempts.append((Continuation(), centre))
-    solution = None
-    for solver, start in attempts:
-        other = solve(problem, solver, start, throw=False)
-        if other.result == Result.success:
-            return other
-        solution = solution or other
-    assert solution is not None
-    return solution
+        yield Continuation(), centre
 
 
 def proves_absence(problem: PerformativeProblem) -> bool:
     """Whether g(M; M) is affine in M (checked at points) and has no zero on an affine feasible set."""
     if not problem.feasible_set.affine:
         return False
-    base = problem.initial_policy()
-    basis = tangent_basis(problem)
+    base, basis = nearest_to_zero(problem), tangent_basis(problem)
 
     def field(v: np.ndarray) -> np.ndarray:
-        M = base + jnp.asarray(basis @ v, base.dtype).reshape(base.shape)
-        return basis.T @ np.asarray(expected_gradient(problem, M), dtype=float).reshape(-1)
+        M = base + (basis @ v).astype(base.dtype).reshape(base.shape)
+        return basis.T @ np.asarray(exact_gradient(problem, M, M), dtype=float).reshape(-1)
 
     q = basis.shape[1]
     origin = field(np.zeros(q))
