@@ -9,20 +9,18 @@ from perfcontrol.evaluate.exact import exact_gradient
 from perfcontrol.evaluate.reaction import reaction_jacobian
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.response.projected import nearest
-from perfcontrol.solvers import AbstractSolver, Continuation, Result, Solution, StablePoint, solve
+from perfcontrol.solvers import Result, Solution, StablePoint, solve
 from perfcontrol.theory.derivatives import hessian, tangent_basis
-from perfcontrol.theory.existence import set_radius
 from perfcontrol.theory.facts import nearest_to_zero
 
-CONTINUED = 256  # free parameters up to which a stable policy is also looked for by continuation
 AFFINE_TOLERANCE = 1e-9
 
 
 def find_stable_policy(problem: PerformativeProblem, starts: int = 3) -> Solution:
-    """The exact solver from the policy nearest to zero, then from random ones; on a bounded set then continuation."""
+    """The exact solver from the policy nearest to zero, then from random ones."""
     first = None
-    for solver, start in _attempts(problem, starts):
-        solution = solve(problem, solver, start, throw=False)
+    for start in _starts(problem, starts):
+        solution = solve(problem, StablePoint(), start, throw=False)
         if solution.result == Result.success:
             return solution
         first = first or solution
@@ -30,13 +28,11 @@ def find_stable_policy(problem: PerformativeProblem, starts: int = 3) -> Solutio
     return first
 
 
-def _attempts(problem: PerformativeProblem, starts: int) -> Iterator[tuple[AbstractSolver, np.ndarray]]:
+def _starts(problem: PerformativeProblem, count: int) -> Iterator[np.ndarray]:
     centre = nearest_to_zero(problem)
-    yield StablePoint(), centre
-    for draw in jax.random.normal(jax.random.key(1), (starts - 1, *centre.shape), centre.dtype):
-        yield StablePoint(), nearest(problem.feasible_set, centre + np.asarray(draw))
-    if set_radius(problem) is not None and centre.size <= CONTINUED:
-        yield Continuation(), centre
+    yield centre
+    for draw in jax.random.normal(jax.random.key(1), (count - 1, *centre.shape), centre.dtype):
+        yield nearest(problem.feasible_set, centre + np.asarray(draw))
 
 
 def proves_absence(problem: PerformativeProblem) -> bool:
