@@ -1,5 +1,7 @@
 """Input checks with one wording of errors: the argument, what was got, what is required, the remedy."""
 
+import inspect
+import re
 import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -29,8 +31,32 @@ def is_concrete(value: Any) -> bool:
     return not isinstance(value, jax.core.Tracer)
 
 
-def as_array(name: str, value: Any) -> Array:
-    """`value` as a finite floating-point array of JAX's current default precision."""
+def check_parentheses(name: str, value: Any, required: str) -> None:
+    """Raise for a class where an object is meant."""
+    if isinstance(value, type):
+        needed = any(p.default is p.empty for p in inspect.signature(value).parameters.values())
+        call = f"pc.{value.__name__}({'...' if needed else ''})"
+        raise fail(name, f"the class {value.__name__}", required, f"Add parentheses: {call}.")
+
+
+def check_instance(name: str, value: Any, kind: type, example: str) -> Any:
+    """`value` where it is an instance of `kind`; else say what that is, by an example, or that parentheses lack."""
+    if isinstance(value, kind):
+        return value
+    words = re.sub("(?<=[a-z])(?=[A-Z])", " ", kind.__name__.removeprefix("Abstract")).lower()
+    required = f"be a {words}, such as `{example}`"
+    if isinstance(value, type) and issubclass(value, kind) and not inspect.isabstract(value):
+        check_parentheses(name, value, required)
+    got = f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
+    remedy = f"Build one, or subclass `pc.{kind.__name__}`." if inspect.isabstract(kind) else "Build one."
+    raise fail(name, "None" if value is None else got, required, remedy)
+
+
+def as_array(name: str, value: Any, remedy: str = "") -> Array:
+    """`value` as a finite floating-point array of JAX's current default precision.
+
+    `remedy` is for numbers that are not finite.
+    """
     global _warned_about_precision
     if isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jnp.floating):
         array = value
@@ -63,13 +89,12 @@ def as_array(name: str, value: Any) -> Array:
         array = jnp.asarray(host, dtype=float)
     # NumPy, not JAX: inside a trace even an operation on known numbers gives a tracer.
     if is_concrete(array) and not np.all(np.isfinite(np.asarray(array))):
-        bad = np.argwhere(~np.isfinite(np.asarray(array)))[0].tolist()
-        raise fail(
-            name,
-            f"{np.asarray(array)[tuple(bad)]} at index {bad}",
-            "have finite entries only",
-            "Remove or impute missing values before building the problem.",
-        )
+        host = np.asarray(array)
+        if host.ndim == 0:
+            raise fail(name, f"{host}", "be finite", remedy or "Pass a finite number.")
+        bad = np.argwhere(~np.isfinite(host))[0].tolist()
+        remedy = remedy or "Replace what is infinite or missing before it is passed on."
+        raise fail(name, f"{host[tuple(bad)]} at index {bad}", "have finite entries only", remedy)
     return array
 
 
@@ -146,7 +171,9 @@ def check_symmetric_psd(name: str, array: Array, remedy: str) -> None:
 
 def as_radius(value: Any) -> Array:
     """The radius of a ball: one nonnegative number."""
-    radius = as_array("radius", value)
+    unbounded = isinstance(value, float | np.floating) and value == np.inf
+    remedy = "Pass pc.Unconstrained() for a set without bound." if unbounded else ""
+    radius = as_array("radius", value, remedy)
     check_shape("radius", radius, (), (), "Pass one number.")
     if is_concrete(radius) and float(radius) < 0:
         raise fail("radius", f"{float(radius)}", "be nonnegative: the set is empty", "Pass a radius ≥ 0.")

@@ -12,6 +12,7 @@ from jaxtyping import Array
 from perfcontrol._checks import (
     InputError,
     as_array,
+    check_instance,
     check_integer,
     check_shape,
     check_time_varying,
@@ -82,25 +83,22 @@ class PerformativeProblem(eqx.Module):
         initial_state: Any = 0,
         structure: AbstractStructure | None = None,
     ):
-        self.system = _instance("system", system, LinearSystem, "Build it with pc.LinearSystem(A, B).")
-        self.cost = _instance("cost", cost, AbstractCost, "Build it with pc.QuadraticCost(Q, R).")
-        self.perturbation = _instance(
+        self.system = check_instance("system", system, LinearSystem, "pc.LinearSystem(A, B)")
+        self.cost = check_instance("cost", cost, AbstractCost, "pc.QuadraticCost(Q, R)")
+        self.perturbation = check_instance(
             "perturbation",
             NoPerturbation() if perturbation is None else perturbation,
             AbstractPerturbation,
-            "Subclass AbstractPerturbation.",
+            "pc.DirectionalPerturbation(directions, scale)",
         )
-        self.feasible_set = _instance(
+        self.feasible_set = check_instance(
             "feasible_set",
             Unconstrained() if feasible_set is None else feasible_set,
             AbstractSet,
-            "Pass for example pc.FrobeniusBall(1.0).",
+            "pc.FrobeniusBall(1.0)",
         )
-        self.structure = _instance(
-            "structure",
-            FullStructure() if structure is None else structure,
-            AbstractStructure,
-            "Pass for example pc.RepeatedBlock(2).",
+        self.structure = check_instance(
+            "structure", FullStructure() if structure is None else structure, AbstractStructure, "pc.RepeatedBlock(2)"
         )
         n, m = system.state_size, system.input_size
         self.horizon = check_integer("horizon", horizon, 1)
@@ -119,13 +117,13 @@ class PerformativeProblem(eqx.Module):
                 f"match the {system.horizon} time steps of the system",
                 "A_t and B_t are given for t = 0..horizon-1.",
             )
-        reacting_noise = callable(noise) and not isinstance(noise, AbstractRandomVector)
+        reacting_noise = callable(noise) and not isinstance(noise, AbstractRandomVector | type)
         self.noise = as_policy_map("noise", noise) if reacting_noise else self._law("noise", noise, n)  # type: ignore
         if isinstance(initial_state, Sequence):
             raise fail("initial_state", "a Sequence", "be one random vector", "Pass an array (n,) or another law.")
         self.initial_state = self._law(
             "initial_state",
-            initial_state if isinstance(initial_state, AbstractRandomVector) else Constant(initial_state),
+            initial_state if isinstance(initial_state, AbstractRandomVector | type) else Constant(initial_state),
             n,
         )
         self.has_gain = not (isinstance(gain, int | float) and gain == 0)
@@ -144,7 +142,7 @@ class PerformativeProblem(eqx.Module):
             self._check_reacting_noise()
 
     def _law(self, name: str, law: Any, size: int) -> AbstractRandomVector:
-        law = _instance(name, law, AbstractRandomVector, "Pass for example pc.Gaussian(mean, covariance).")
+        law = check_instance(name, law, AbstractRandomVector, "pc.Gaussian(mean, covariance)")
         law = law.resize(size)
         if law.size != size:
             raise fail(name, f"dimension {law.size}", f"have dimension n = {size}", "One entry per state.")
@@ -276,7 +274,7 @@ def _zero_gain(gain: Array, m: int, n: int) -> Array:
     return jnp.zeros((m, n), gain.dtype)
 
 
-def _instance(name: str, value: Any, kind: type, remedy: str) -> Any:
-    if not isinstance(value, kind):
-        raise fail(name, type(value).__name__, f"be a {kind.__name__}", remedy)
-    return value
+def check_problem(problem: Any) -> PerformativeProblem:
+    """`problem` itself; raises InputError for anything else."""
+    example = "pc.PerformativeProblem(system=..., horizon=..., noise=..., cost=...)"
+    return check_instance("problem", problem, PerformativeProblem, example)

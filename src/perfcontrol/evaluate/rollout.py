@@ -16,7 +16,7 @@ from perfcontrol._linalg import Diagonal, Matrix, along_time, matvec
 from perfcontrol._programs import program
 from perfcontrol.perturbations import Draws
 from perfcontrol.policy import feedforward
-from perfcontrol.problem import PerformativeProblem
+from perfcontrol.problem import PerformativeProblem, check_problem
 
 LANES = 8  # paths worked on together: twice as fast as all at once
 CACHE = 2**24  # bytes of perturbations beyond which working on more paths together slows them down
@@ -144,7 +144,7 @@ def _path_costs(problem: PerformativeProblem, M: Array, deployed: Array, key: Ar
 
 def check_pair(problem: PerformativeProblem, M: Any, deployed: Any) -> tuple[Array, Array]:
     """Both policies as arrays; `deployed=None` means M."""
-    M = problem.check_policy("M", M)
+    M = check_problem(problem).check_policy("M", M)
     return M, M if deployed is None else problem.check_policy("deployed", deployed)
 
 

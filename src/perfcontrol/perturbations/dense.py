@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Key
 
-from perfcontrol._checks import as_array, fail
+from perfcontrol._checks import as_array, check_instance, fail
 from perfcontrol.perturbations.base import AbstractPerturbation, CovarianceOperator, DenseDraws, Draws, zero_mean
 from perfcontrol.perturbations.dependence import as_scale, check_values
 from perfcontrol.perturbations.scalar_laws import SCALAR_LAWS
@@ -84,6 +84,8 @@ class DensePerturbation(AbstractPerturbation):
             if law.mean.ndim != 1:
                 required = "be the same at all times"
                 raise fail("law", f"{type(law).__name__} of {law.mean.shape[0]} steps", required, "Use `mean` instead.")
+        elif isinstance(law, type):
+            check_instance("law", law, AbstractRandomVector, "pc.Gaussian(mean, covariance)")
         elif law in WHITE_LAWS:
             self.law, self.kind = None, law
         else:

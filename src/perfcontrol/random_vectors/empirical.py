@@ -20,7 +20,7 @@ class Empirical(AbstractRandomVector):
     samples: Array
 
     def __init__(self, samples: Any):
-        self.samples = as_array("samples", samples)
+        self.samples = as_array("samples", samples, "Leave out the rows with missing values.")
         if self.samples.ndim != 2 or self.samples.shape[0] == 0:
             raise fail("samples", f"{self.samples.shape}", "have shape (sample, n)", "Pass at least one row.")
 

@@ -5,7 +5,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Key
 
-from perfcontrol._checks import as_array, check_shape, fail
+from perfcontrol._checks import as_array, check_instance, check_shape, fail
 from perfcontrol.random_vectors.base import AbstractRandomVector
 
 
@@ -26,7 +26,8 @@ class Linear(AbstractRandomVector):
         self.matrix = as_array("matrix", matrix)
         if self.matrix.ndim != 2:
             raise fail("matrix", f"{self.matrix.shape}", "have shape (n, k)", "One row per output component.")
-        self.law = law.resize(self.matrix.shape[1])
+        example = "pc.Gaussian(mean, covariance)"
+        self.law = check_instance("law", law, AbstractRandomVector, example).resize(self.matrix.shape[1])
         if self.law.size != self.matrix.shape[1]:
             raise fail(
                 "matrix",

@@ -22,7 +22,7 @@ from perfcontrol.evaluate.cost_to_go import CostToGo, require_moments, world_of
 from perfcontrol.evaluate.exact import exact_gradient, weigh
 from perfcontrol.evaluate.reaction import reaction_jacobian
 from perfcontrol.evaluate.rollout import check_pair
-from perfcontrol.problem import PerformativeProblem
+from perfcontrol.problem import PerformativeProblem, check_problem
 from perfcontrol.response import quadratic as quadratics
 from perfcontrol.response.affine import Affine, AffineByProducts
 from perfcontrol.response.projected import Projected, nearest
@@ -184,7 +184,7 @@ def best_response(problem: PerformativeProblem, deployed: Any) -> Array:
     Raises:
         InputError: wrong shapes, or a cost or perturbation without closed moments.
     """
-    deployed = problem.check_policy("deployed", deployed)
+    deployed = check_problem(problem).check_policy("deployed", deployed)
     require_moments(problem)
     if not known(problem, deployed):
         return differentiable_response(problem, deployed)

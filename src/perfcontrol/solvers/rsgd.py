@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from perfcontrol._checks import check_integer
+from perfcontrol._checks import check_integer, check_parentheses, fail
 from perfcontrol._programs import Numbers, choose
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.solvers.base import AbstractSolver, State, start
@@ -70,6 +70,13 @@ class RSGD(AbstractSolver):
         self.gradient = Pathwise() if gradient is None else gradient
         self.schedule = Greedy() if schedule is None else schedule
         self.transform = transform
+        for name, part, ability, example in (
+            ("gradient", self.gradient, "check", "pc.Pathwise()"),
+            ("schedule", self.schedule, "deploys", "pc.Greedy()"),
+        ):
+            check_parentheses(name, part, f"be an object such as `{example}`")
+            if not hasattr(part, ability):
+                raise fail(name, type(part).__name__, f"be an object such as `{example}`", "See the reference of RSGD.")
 
     @property
     def max_steps(self) -> int:

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from perfcontrol._checks import check_integer, check_key, fail, is_concrete
+from perfcontrol._checks import check_instance, check_integer, check_key, fail, is_concrete
 from perfcontrol._programs import on_host
-from perfcontrol.problem import PerformativeProblem
+from perfcontrol.problem import PerformativeProblem, check_problem
 from perfcontrol.solvers.base import AbstractSolver, Solution, SolveError
 from perfcontrol.solvers.result import Result
 from perfcontrol.solvers.runs import Record, Run, from_host, identity, in_chunks, traced
@@ -49,11 +49,8 @@ def solve(
         InputError: arguments that do not fit, before any work.
         SolveError: the run failed and `throw` is True; its `.solution` is what was reached.
     """
-    if not isinstance(problem, PerformativeProblem):
-        raise fail("problem", type(problem).__name__, "be a PerformativeProblem", "Build it first.")
-    if not isinstance(solver, AbstractSolver):
-        raise fail("solver", type(solver).__name__, "be a solver", "Pass for example pc.StablePoint().")
-    solver.check(problem)
+    check_problem(problem)
+    check_instance("solver", solver, AbstractSolver, "pc.StablePoint()").check(problem)
     key = check_key(key) if solver.needs_key or key is not None else None
     every = check_integer("every", every, 1)
     total = solver.max_steps if max_steps is None else check_integer("max_steps", max_steps, 0)

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from perfcontrol._checks import as_array, fail, is_concrete
+from perfcontrol._checks import as_array, check_parentheses, fail, is_concrete
 
 
 class InverseStep(eqx.Module):
@@ -60,6 +60,7 @@ def as_step_size(value: Any) -> Any:
     """A number, an `InverseStep`, or a function n -> η_n."""
     if isinstance(value, InverseStep | ConstantStep | _FunctionStep):
         return value
+    check_parentheses("step_size", value, "be a number, a function of n, or `pc.InverseStep(phi1, phi2)`")
     if callable(value):
         return value if isinstance(value, eqx.Module) else _FunctionStep(value)
     return ConstantStep(value)

@@ -7,7 +7,7 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Array
 
-from perfcontrol._checks import as_array, check_shape, check_symmetric_psd, fail
+from perfcontrol._checks import as_array, check_instance, check_shape, check_symmetric_psd, fail
 from perfcontrol.systems.linear import LinearSystem
 
 
@@ -34,6 +34,7 @@ def design_gain(system: LinearSystem, *, Q: Any, R: Any, directions: Any = None,
     References:
         Gravell, Esfahani and Summers 2019 for multiplicative noise.
     """
+    check_instance("system", system, LinearSystem, "pc.LinearSystem(A, B)")
     n, m = system.state_size, system.input_size
     Q, R = as_array("Q", Q), as_array("R", R)
     check_shape("Q", Q, (n, n), ("n", "n"))

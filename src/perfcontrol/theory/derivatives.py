@@ -13,7 +13,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from perfcontrol._checks import fail
 from perfcontrol._linalg import as_dense
 from perfcontrol._programs import on_host, program
 from perfcontrol.costs import QuadraticCost
@@ -27,13 +26,6 @@ from perfcontrol.systems import LinearSystem
 from perfcontrol.theory.facts import nearest_to_zero
 
 DENSE_LIMIT = 1500  # free parameters up to which p × p matrices are built
-
-
-def check_problem(problem: object) -> PerformativeProblem:
-    """`problem` itself; raises InputError for anything else."""
-    if not isinstance(problem, PerformativeProblem):
-        raise fail("problem", type(problem).__name__, "be a PerformativeProblem", "Build it first.")
-    return problem
 
 
 def obstacles(problem: PerformativeProblem) -> list[str]:

@@ -11,9 +11,8 @@ import numpy as np
 from jaxtyping import Array
 
 from perfcontrol._checks import check_integer, check_key, fail
-from perfcontrol.problem import PerformativeProblem
+from perfcontrol.problem import PerformativeProblem, check_problem
 from perfcontrol.theory.assumptions import Status
-from perfcontrol.theory.derivatives import check_problem
 
 METHODS = ("analytic", "coupling", "transport")
 

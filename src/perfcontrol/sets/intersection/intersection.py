@@ -1,6 +1,7 @@
 """The set of policies that lie in several sets."""
 
 import math
+from collections.abc import Iterable
 from typing import Any
 
 import equinox as eqx
@@ -9,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from perfcontrol._checks import fail, is_concrete
+from perfcontrol._checks import check_instance, fail, is_concrete
 from perfcontrol.sets.base import AbstractSet
 from perfcontrol.sets.intersection.dykstra import Sets
 from perfcontrol.sets.intersection.projection import ACCURACY, project, solve
@@ -36,8 +37,9 @@ class Intersection(AbstractSet):
     sets: Sets
 
     def __init__(self, sets: Any):
-        if isinstance(sets, AbstractSet) or not all(isinstance(member, AbstractSet) for member in sets):
-            raise fail("sets", repr(type(sets).__name__), "be a sequence of feasible sets", "Pass a list of sets.")
+        if isinstance(sets, AbstractSet) or not isinstance(sets, Iterable):
+            raise fail("sets", type(sets).__name__, "be a sequence of feasible sets", "Pass a list of sets.")
+        sets = [check_instance(f"sets[{i}]", member, AbstractSet, "pc.Box(0.0, 1.0)") for i, member in enumerate(sets)]
         flat = [part for member in sets for part in (member.sets if isinstance(member, Intersection) else (member,))]
         if not flat:
             raise fail("sets", "none", "hold at least one set", "Pass pc.Unconstrained() for no constraint.")

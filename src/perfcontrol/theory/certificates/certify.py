@@ -3,15 +3,14 @@
 from typing import Any
 
 from perfcontrol._calls import check_keywords
-from perfcontrol._checks import fail
-from perfcontrol.problem import PerformativeProblem
+from perfcontrol._checks import check_parentheses, fail
+from perfcontrol.problem import PerformativeProblem, check_problem
 from perfcontrol.theory.certificates.certificate import Certificate
 from perfcontrol.theory.certificates.global_bound import GlobalBound
 from perfcontrol.theory.certificates.kind import AbstractCertificateKind
 from perfcontrol.theory.certificates.paper import Paper
 from perfcontrol.theory.certificates.rigorous import Rigorous
 from perfcontrol.theory.certificates.sharp import Sharp
-from perfcontrol.theory.derivatives import check_problem
 
 SHORTHANDS: dict[str, type[AbstractCertificateKind]] = {
     kind.name: kind for kind in (Paper, Rigorous, GlobalBound, Sharp)
@@ -25,10 +24,9 @@ def as_kind(kind: Any, settings: dict[str, Any] | None = None) -> AbstractCertif
     if isinstance(kind, AbstractCertificateKind):
         check_keywords(f"a call that is given pc.{type(kind).__name__}(...)", settings, ())
         return kind
-    if isinstance(kind, type) and issubclass(kind, AbstractCertificateKind):
-        raise fail("kind", f"the class {kind.__name__}", "be an object", f"Add parentheses: pc.{kind.__name__}().")
+    required = f"be one of {KINDS}, or an object such as `pc.Sharp()`"
+    check_parentheses("kind", kind, required)
     if kind not in KINDS:
-        required = f"be one of {KINDS}, or an object such as pc.Sharp()"
         raise fail("kind", repr(kind), required, "Pass one of these names.")
     return SHORTHANDS[kind](**settings)
 

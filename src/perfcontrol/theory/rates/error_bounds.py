@@ -15,12 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from perfcontrol._checks import check_integer, fail
-from perfcontrol.problem import PerformativeProblem
+from perfcontrol.problem import PerformativeProblem, check_problem
 from perfcontrol.solvers import InverseStep
 from perfcontrol.solvers.step_sizes import as_step_size
 from perfcontrol.theory.certificates.certify import as_kind
 from perfcontrol.theory.certificates.kind import AbstractCertificateKind
-from perfcontrol.theory.derivatives import check_problem
 from perfcontrol.theory.rates.step_size import descent_constants
 
 

@@ -4,11 +4,10 @@ import math
 from typing import Any, NamedTuple
 
 from perfcontrol._checks import fail
-from perfcontrol.problem import PerformativeProblem
+from perfcontrol.problem import PerformativeProblem, check_problem
 from perfcontrol.theory.certificates.certificate import Certificate
 from perfcontrol.theory.certificates.certify import as_kind
 from perfcontrol.theory.certificates.kind import AbstractCertificateKind
-from perfcontrol.theory.derivatives import check_problem
 
 
 class TheoremStepSize(NamedTuple):

@@ -3,9 +3,9 @@
 from typing import Any
 
 from perfcontrol._checks import fail
-from perfcontrol.problem import PerformativeProblem
+from perfcontrol.problem import PerformativeProblem, check_problem
 from perfcontrol.solvers import Result
-from perfcontrol.theory.derivatives import check_problem, obstacles
+from perfcontrol.theory.derivatives import obstacles
 from perfcontrol.theory.stability.local_model import LocalModel, largest_mean_step, local_model
 from perfcontrol.theory.stability.mean_square import MeanSquareStability, stability_at
 from perfcontrol.theory.stability.stable_policy import find_stable_policy

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg
 
-from perfcontrol._checks import as_array, check_shape, check_time_varying, fail
+from perfcontrol._checks import as_array, check_instance, check_shape, check_time_varying, fail
 from perfcontrol.systems import LinearSystem
 
 RATES = np.logspace(-3, 2, 26)  # how far above the spectral radius, relative to its size
@@ -137,8 +137,7 @@ def strong_stability(
     References:
         Definition 2; Proposition 1 for the almost-sure version.
     """
-    if not isinstance(system, LinearSystem):
-        raise fail("system", type(system).__name__, "be a LinearSystem", "Build it with pc.LinearSystem(A, B).")
+    check_instance("system", system, LinearSystem, "pc.LinearSystem(A, B)")
     K = as_array("K", K)
     n, m = system.state_size, system.input_size
     if K.ndim == 3:
