@@ -167,9 +167,9 @@ class PerformativeProblem(eqx.Module):
             jax.eval_shape(moments, policy)
             if is_concrete(self.system.A):
                 moments(self.structure.lift(self.initial_policy()))
-        except InputError:
-            raise
         except (TypeError, ValueError) as error:
+            if isinstance(error, InputError) and not isinstance(error, TypeError):  # about the law, not the call
+                raise
             raise fail(
                 "noise",
                 f"an error from the policy map ({error})",
