@@ -3,182 +3,27 @@
 Two policies are told apart everywhere: `M` is evaluated or improved, `deployed` is the one the world reacts to.
 """
 
-from perfcontrol import experiments
-from perfcontrol._calls import explain_calls
-from perfcontrol._checks import InputError
-from perfcontrol.costs import AbstractCost, ConvexCost, QuadraticCost
-from perfcontrol.evaluate import (
-    Estimate,
-    StateMoments,
-    Trajectories,
-    estimate_cost,
-    expected_cost,
-    expected_cost_by_moments,
-    expected_gradient,
-    path_gradient,
-    recover_noise,
-    sample_gradient,
-    simulate,
-    state_moments,
-)
-from perfcontrol.fit import Fit, Logs, fit
-from perfcontrol.perturbations import (
-    AbstractPerturbation,
-    DensePerturbation,
-    DirectionalPerturbation,
-    FinitePerturbation,
-    NoPerturbation,
-    SampledPerturbation,
-    StockPerturbation,
-)
-from perfcontrol.policy import DisturbanceAction
-from perfcontrol.policy_maps import AbstractPolicyMap, Affine, Function, Norm
-from perfcontrol.problem import PerformativeProblem
-from perfcontrol.random_vectors import (
-    AbstractRandomVector,
-    Constant,
-    Empirical,
-    Gaussian,
-    Linear,
-    Rademacher,
-    Sequence,
-    TruncatedGaussian,
-    Uniform,
-)
-from perfcontrol.response import best_response, residual
-from perfcontrol.sets import (
-    AbstractSet,
-    AbstractStructure,
-    Box,
-    FrobeniusBall,
-    FullStructure,
-    Intersection,
-    RepeatedBlock,
-    RowSimplex,
-    RowSum,
-    SpectralBall,
-    Support,
-    Unconstrained,
-)
-from perfcontrol.solvers import (
-    RRM,
-    RSGD,
-    AbstractSolver,
-    Continuation,
-    Exact,
-    Greedy,
-    InverseStep,
-    Lazy,
-    Pathwise,
-    Result,
-    Solution,
-    SolveError,
-    StablePoint,
-    solve,
-)
-from perfcontrol.systems import LinearSystem, design_gain
-from perfcontrol.theory import (
-    AbstractCertificateKind,
-    Certificate,
-    GlobalBound,
-    Paper,
-    Rigorous,
-    Sharp,
-    certify,
-    estimate_sensitivity,
-    rrm_error_bound,
-    rsgd_error_bound,
-    safe_step,
-    strong_stability,
-    theorem_step_size,
-)
+from importlib import import_module
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any
 
-__all__ = [
-    "RRM",
-    "RSGD",
-    "AbstractCertificateKind",
-    "AbstractCost",
-    "AbstractPerturbation",
-    "AbstractPolicyMap",
-    "AbstractRandomVector",
-    "AbstractSet",
-    "AbstractSolver",
-    "AbstractStructure",
-    "Affine",
-    "Box",
-    "Certificate",
-    "Constant",
-    "Continuation",
-    "ConvexCost",
-    "DensePerturbation",
-    "DirectionalPerturbation",
-    "DisturbanceAction",
-    "Empirical",
-    "Estimate",
-    "Exact",
-    "FinitePerturbation",
-    "Fit",
-    "FrobeniusBall",
-    "FullStructure",
-    "Function",
-    "Gaussian",
-    "GlobalBound",
-    "Greedy",
-    "InputError",
-    "Intersection",
-    "InverseStep",
-    "Lazy",
-    "Linear",
-    "LinearSystem",
-    "Logs",
-    "NoPerturbation",
-    "Norm",
-    "Paper",
-    "Pathwise",
-    "PerformativeProblem",
-    "QuadraticCost",
-    "Rademacher",
-    "RepeatedBlock",
-    "Result",
-    "Rigorous",
-    "RowSimplex",
-    "RowSum",
-    "SampledPerturbation",
-    "Sequence",
-    "Sharp",
-    "Solution",
-    "SolveError",
-    "SpectralBall",
-    "StablePoint",
-    "StateMoments",
-    "StockPerturbation",
-    "Support",
-    "Trajectories",
-    "TruncatedGaussian",
-    "Unconstrained",
-    "Uniform",
-    "best_response",
-    "certify",
-    "design_gain",
-    "estimate_cost",
-    "estimate_sensitivity",
-    "expected_cost",
-    "expected_cost_by_moments",
-    "expected_gradient",
-    "experiments",
-    "fit",
-    "path_gradient",
-    "recover_noise",
-    "residual",
-    "rrm_error_bound",
-    "rsgd_error_bound",
-    "safe_step",
-    "sample_gradient",
-    "simulate",
-    "solve",
-    "state_moments",
-    "strong_stability",
-    "theorem_step_size",
-]
+if TYPE_CHECKING:  # editors and type checkers read the list
+    from perfcontrol._api import *  # noqa: F403
+    from perfcontrol._api import __all__ as __all__
 
-explain_calls(__name__, globals(), __all__)
+
+def __getattr__(name: str) -> Any:
+    """What `_api` lists, and rooms such as `plotting`, when first asked for: the command line answers before JAX is
+    there."""
+    if name == "__all__" or not name.startswith("_"):
+        api = import_module("perfcontrol._api")
+        globals().update({public: getattr(api, public) for public in api.__all__}, __all__=api.__all__)
+        if name in globals():
+            return globals()[name]
+        if find_spec(f"perfcontrol.{name}"):
+            return import_module(f"perfcontrol.{name}")
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}", name=name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__getattr__("__all__")})

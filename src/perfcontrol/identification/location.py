@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from perfcontrol.fit.moments import mean_sums
-from perfcontrol.fit.transitions import Transitions
+from perfcontrol.identification.moments import mean_sums
+from perfcontrol.identification.transitions import Transitions
 
 COLLINEAR = 1e-6  # singular values of standardised regressors below this share of the largest count as zero
 

@@ -4,11 +4,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from perfcontrol.fit.blocks import Block
-from perfcontrol.fit.covariance import Spread, scale_fit, variances
-from perfcontrol.fit.location import Location, jacobian, least_squares, reweighted
-from perfcontrol.fit.moments import Sums, covariance_sums, inverse_factors, mean_sums, upper
-from perfcontrol.fit.transitions import Transitions
+from perfcontrol.identification.blocks import Block
+from perfcontrol.identification.covariance import Spread, scale_fit, variances
+from perfcontrol.identification.location import Location, jacobian, least_squares, reweighted
+from perfcontrol.identification.moments import Sums, covariance_sums, inverse_factors, mean_sums, upper
+from perfcontrol.identification.transitions import Transitions
 
 ROUNDS = 12
 SETTLED = 1e-7

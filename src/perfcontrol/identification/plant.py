@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from perfcontrol.fit.features import Features
-from perfcontrol.fit.logs import Logs
+from perfcontrol.identification.features import Features
+from perfcontrol.identification.logs import Logs
 from perfcontrol.perturbations import AbstractPerturbation, DirectionalPerturbation, NoPerturbation
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.random_vectors import AbstractRandomVector, Constant, Gaussian

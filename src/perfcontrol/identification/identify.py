@@ -5,13 +5,13 @@ from typing import Any
 import numpy as np
 
 from perfcontrol._checks import fail
-from perfcontrol.fit.estimate import covariances, estimate, images_of
-from perfcontrol.fit.features import CONSTANT, Features, features_of
-from perfcontrol.fit.logs import Logs
-from perfcontrol.fit.moments import covariance_sums, inverse_factors, mean_sums
-from perfcontrol.fit.result import Fit
-from perfcontrol.fit.selection import best_mean, best_scale, candidates
-from perfcontrol.fit.transitions import Transitions, transitions_of
+from perfcontrol.identification.estimate import covariances, estimate, images_of
+from perfcontrol.identification.features import CONSTANT, Features, features_of
+from perfcontrol.identification.logs import Logs
+from perfcontrol.identification.moments import covariance_sums, inverse_factors, mean_sums
+from perfcontrol.identification.result import Fit
+from perfcontrol.identification.selection import best_mean, best_scale, candidates
+from perfcontrol.identification.transitions import Transitions, transitions_of
 
 SATURATED = 12  # deployments up to which selection starts from one coefficient for each of them
 

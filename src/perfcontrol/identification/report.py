@@ -7,7 +7,7 @@ import numpy as np
 from perfcontrol.evaluate import Estimate
 
 if TYPE_CHECKING:
-    from perfcontrol.fit.result import Fit
+    from perfcontrol.identification.result import Fit
 
 NORMAL = 1.959963984540054  # 97.5 % point of the normal law
 VALUES = ("estimate", "standard_error", "low", "high")

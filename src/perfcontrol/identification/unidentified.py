@@ -4,9 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from perfcontrol.fit.features import Features
-from perfcontrol.fit.location import Location
-from perfcontrol.fit.transitions import Transitions
+from perfcontrol.identification.features import Features
+from perfcontrol.identification.location import Location
+from perfcontrol.identification.transitions import Transitions
 
 
 class Gap(NamedTuple):

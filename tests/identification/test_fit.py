@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import perfcontrol as pc
-from tests.fit.worlds import small_policies, small_world
+from tests.identification.worlds import small_policies, small_world
 from tests.tools import assert_close, assert_refused, central_differences
 
 WORLD = small_world()

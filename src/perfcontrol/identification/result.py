@@ -10,15 +10,15 @@ import numpy as np
 
 from perfcontrol._checks import check_integer, check_key, fail
 from perfcontrol.evaluate import Estimate
-from perfcontrol.fit.covariance import semidefinite
-from perfcontrol.fit.estimate import Moments
-from perfcontrol.fit.features import Features
-from perfcontrol.fit.location import jacobian
-from perfcontrol.fit.logs import Logs
-from perfcontrol.fit.plant import Coefficients, build, logged_start
-from perfcontrol.fit.report import paragraph, table
-from perfcontrol.fit.transitions import Transitions
-from perfcontrol.fit.unidentified import gaps
+from perfcontrol.identification.covariance import semidefinite
+from perfcontrol.identification.estimate import Moments
+from perfcontrol.identification.features import Features
+from perfcontrol.identification.location import jacobian
+from perfcontrol.identification.logs import Logs
+from perfcontrol.identification.plant import Coefficients, build, logged_start
+from perfcontrol.identification.report import paragraph, table
+from perfcontrol.identification.transitions import Transitions
+from perfcontrol.identification.unidentified import gaps
 from perfcontrol.problem import PerformativeProblem
 
 

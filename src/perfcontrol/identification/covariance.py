@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import optimize
 
-from perfcontrol.fit.moments import Sums, symmetric_basis, upper
+from perfcontrol.identification.moments import Sums, symmetric_basis, upper
 
 PATTERNS = 8  # deployments up to which every pattern of signs of a scale is tried
 CROSSING = 9.0  # how much better a scale must fit, in squared standard errors, before it is believed to cross zero

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from perfcontrol.fit.transitions import Transitions
+from perfcontrol.identification.transitions import Transitions
 
 FLOOR = 1e-8  # of the mean squared residual: weights of noise that is singular stay finite
 

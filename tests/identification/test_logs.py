@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 import perfcontrol as pc
-from perfcontrol.fit import files
-from tests.fit.worlds import small_policies, small_world
+from perfcontrol.identification import files
+from tests.identification.worlds import small_policies, small_world
 from tests.tools import assert_refused
 
 X, U, DEPLOYED = small_world().logs(0, small_policies()[:2], 3, 5)

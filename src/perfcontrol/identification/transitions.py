@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from perfcontrol._checks import check_integer, fail
-from perfcontrol.fit.logs import Logs
+from perfcontrol.identification.logs import Logs
 
 UNITS = 40  # fewer episodes than this are cut into blocks, for the sake of standard errors
 ROWS = 20_000  # transitions worked on at a time

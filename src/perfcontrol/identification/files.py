@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from perfcontrol._checks import fail
-from perfcontrol.fit.logs import Logs
+from perfcontrol.identification.logs import Logs
 
 EPISODES, POLICIES = "episodes.csv", "policies.csv"
 

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from perfcontrol.fit.covariance import scale_fit, variances
-from perfcontrol.fit.features import CONSTANT, NORM, SQUARED_NORM, Features, affine
-from perfcontrol.fit.location import jacobian
-from perfcontrol.fit.moments import Sums, upper
+from perfcontrol.identification.covariance import scale_fit, variances
+from perfcontrol.identification.features import CONSTANT, NORM, SQUARED_NORM, Features, affine
+from perfcontrol.identification.location import jacobian
+from perfcontrol.identification.moments import Sums, upper
 
 FOLDS = 5
 MARGIN = 2.0  # log-likelihood that a reaction must gain on unseen data before it is preferred to none

@@ -1,0 +1,7 @@
+"""Identification: from logs of a few deployments to a problem with its uncertainty."""
+
+from perfcontrol.identification.identify import fit
+from perfcontrol.identification.logs import Logs
+from perfcontrol.identification.result import Fit
+
+__all__ = ["Fit", "Logs", "fit"]
