@@ -3,7 +3,15 @@
 import perfcontrol.experiments as experiments
 from perfcontrol._calls import explain_calls
 from perfcontrol._checks import InputError
-from perfcontrol.costs import AbstractCost, ConvexCost, QuadraticCost
+from perfcontrol.costs import (
+    AbstractCost,
+    ConvexCost,
+    Huber,
+    LinearExponential,
+    LogCosh,
+    OneSidedQuadratic,
+    QuadraticCost,
+)
 from perfcontrol.evaluate import (
     Estimate,
     StateMoments,
@@ -121,15 +129,19 @@ __all__ = [
     "Gaussian",
     "GlobalBound",
     "Greedy",
+    "Huber",
     "InputError",
     "Intersection",
     "InverseStep",
     "Lazy",
     "Linear",
+    "LinearExponential",
     "LinearSystem",
+    "LogCosh",
     "Logs",
     "NoPerturbation",
     "Norm",
+    "OneSidedQuadratic",
     "Paper",
     "Pathwise",
     "PerformativeProblem",

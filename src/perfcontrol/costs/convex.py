@@ -5,10 +5,12 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+import numpy as np
+from jaxtyping import Array, Float
 
 from perfcontrol._checks import as_array, as_callable, fail, is_concrete
 from perfcontrol.costs.base import AbstractCost, as_discount, stage_factors
+from perfcontrol.costs.convexity import check_convexity
 
 
 class ConvexCost(AbstractCost):
@@ -19,7 +21,8 @@ class ConvexCost(AbstractCost):
 
     Args:
         function: (t, x, u) -> scalar, for an integer t = 0..T (traced), x (n,) and u (m,). A plain function is static;
-            numbers to sweep belong in an eqx.Module or jax.tree_util.Partial.
+            numbers to sweep belong in an eqx.Module or jax.tree_util.Partial. Ready-made: `Huber`, `LogCosh`,
+            `OneSidedQuadratic`, `LinearExponential`. Constants that it knows as attributes need not be passed.
         strong_convexity: μ, jointly in x and u; None for unknown.
         smoothness: ς, the Lipschitz constant of the joint gradient, cross derivatives included; None for unknown.
         gradient_bound: G in ‖∇c_t‖ ≤ G D wherever ‖x‖, ‖u‖ ≤ D; None for unknown.
@@ -49,9 +52,13 @@ class ConvexCost(AbstractCost):
     ):
         self.discount = as_discount(discount)
         self.function = as_callable("function", function)
-        self.strong_convexity = _constant("strong_convexity", strong_convexity)
-        self.smoothness = _constant("smoothness", smoothness)
-        self.gradient_bound = _constant("gradient_bound", gradient_bound)
+
+        def constant(name: str, value: Any) -> Array | None:
+            return _constant(name, getattr(self.function, name, None) if value is None else value)
+
+        self.strong_convexity = constant("strong_convexity", strong_convexity)
+        self.smoothness = constant("smoothness", smoothness)
+        self.gradient_bound = constant("gradient_bound", gradient_bound)
         mu, sigma = self.strong_convexity, self.smoothness
         if mu is not None and sigma is not None and is_concrete(mu) and is_concrete(sigma) and float(mu) > float(sigma):
             raise fail(
@@ -77,6 +84,20 @@ class ConvexCost(AbstractCost):
         if value.shape != () or not jnp.issubdtype(value.dtype, jnp.floating):
             got = f"{value.dtype} of shape {value.shape}"
             raise fail("function", got, "return one real number", "Sum over the components of x and u.")
+
+    def check_convexity(self, x: Float[Array, "S T1 n"], u: Float[Array, "S T1 m"]) -> None:
+        """Raise InputError where the function is not convex, not smooth, or breaks a declared constant.
+
+        Looked at: points of given paths, and others up to twice as far out. What holds there is not proved elsewhere.
+        """
+        count, length = x.shape[:2]
+        z = np.concatenate([np.asarray(x), np.asarray(u)], axis=2)
+        spread = np.sqrt(np.mean(z**2, axis=(0, 1)))
+        beyond = np.random.default_rng(0).normal(size=z.shape) * 2 * np.where(spread > 0, spread, 1)
+        points = np.concatenate([z, beyond.astype(z.dtype)]).transpose(1, 0, 2).reshape(-1, z.shape[2])
+        constants = {"strong_convexity": self.strong_convexity, "smoothness": self.smoothness}
+        times = np.repeat(np.arange(length), 2 * count)
+        check_convexity(self.function, constants, times, points[:, : x.shape[2]], points[:, x.shape[2] :])
 
     def _times(self, x: Array) -> Array:
         return jnp.arange(x.shape[0])
