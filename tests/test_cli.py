@@ -3,9 +3,10 @@
 from pathlib import Path
 
 import pytest
+import typer
 from typer.testing import CliRunner
 
-from perfcontrol.cli import app
+from perfcontrol.cli.app import app, in_words
 
 runner = CliRunner()
 
@@ -38,4 +39,26 @@ def test_unwritable_folder_exits_with_status_one_before_work(tmp_path: Path) -> 
     (tmp_path / "file").write_text("in the way")
     result = runner.invoke(app, ["reproduce", "--quick", "--out", str(tmp_path / "file" / "deeper")])
     assert result.exit_code == 1
-    assert "cannot write" in result.output + result.stderr
+    said = " ".join((result.output + result.stderr).split())
+    assert "cannot write" in said and "a file stands where a folder should be" in said
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (PermissionError(13, "Permission denied", "/a/b"), ("/a/b", "permission", "Choose a folder")),
+        (FileExistsError(17, "File exists", "/a/b"), ("/a/b", "a file stands where a folder should be")),
+        (NotADirectoryError(20, "Not a directory", "/a/b"), ("/a/b", "a file stands where a folder should be")),
+        (OSError(28, "No space left on device", "/a/b"), ("the disk is full", "is kept")),
+        (OSError(30, "Read-only file system", "/a/b"), ("read-only", "Choose another path")),
+        (OSError(5, "Input/output error"), ("Input/output error", "Check the path and the disk")),
+    ],
+)
+def test_errors_of_the_operating_system_are_said_in_words(error, words, capsys):
+    with pytest.raises(typer.Exit) as caught, in_words("write the table"):
+        raise error
+    said = " ".join(capsys.readouterr().err.split())
+    assert caught.value.exit_code == 1
+    assert said.startswith("error: cannot write the table")
+    for word in words:
+        assert word in said

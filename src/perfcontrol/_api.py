@@ -1,6 +1,7 @@
 """Every public name, as `import perfcontrol as pc` offers them."""
 
 import perfcontrol.experiments as experiments
+from perfcontrol._cache import cache
 from perfcontrol._calls import explain_calls
 from perfcontrol._checks import InputError
 from perfcontrol.costs import (
@@ -167,6 +168,7 @@ __all__ = [
     "Unconstrained",
     "Uniform",
     "best_response",
+    "cache",
     "certify",
     "design_gain",
     "estimate_cost",

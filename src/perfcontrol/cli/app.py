@@ -1,0 +1,97 @@
+"""The `perfcontrol` command: what its subcommands share. JAX is imported inside them, so that help comes at once."""
+
+import contextlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import typer
+from rich.console import Console
+
+app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+console = Console()
+errors = Console(stderr=True)
+
+
+class _Cache:
+    wanted = True
+
+
+@app.callback()
+def root(
+    no_cache: bool = typer.Option(False, "--no-cache", help="Keep no compiled programs on disk."),
+) -> None:
+    """Performative control of linear dynamical systems.
+
+    Compiled programs are kept in the user's cache folder, or in the folder that PERFCONTROL_CACHE names.
+    """
+    _Cache.wanted = not no_cache
+
+
+def refuse(message: str, status: int = 2) -> typer.Exit:
+    """Say what is wrong and give the exit to raise."""
+    errors.print(f"error: {message}", style="red", markup=False, highlight=False)
+    return typer.Exit(status)
+
+
+@contextlib.contextmanager
+def in_words(doing: str) -> Iterator[None]:
+    """Errors of the operating system in words: what was tried, which file, what to do."""
+    try:
+        yield
+    except OSError as error:
+        where = error.filename2 or error.filename
+        at = f" at {where}" if where else ""
+        raise refuse(f"cannot {doing}{at}: {_why(error)}", 1) from None
+
+
+def _why(error: OSError) -> str:
+    remedies: dict[type[OSError] | int, str] = {
+        PermissionError: "no permission. Choose a folder that you may write to, or change its permissions.",
+        FileNotFoundError: "it does not exist. Check the path.",
+        FileExistsError: "a file stands where a folder should be. Choose another path, or move that file.",
+        NotADirectoryError: "a file stands where a folder should be. Choose another path, or move that file.",
+        IsADirectoryError: "a folder stands where a file should be. Choose another path.",
+        28: "the disk is full. Free some space, or choose another disk; what was finished is kept.",
+        30: "the disk is read-only. Choose another path.",
+        36: "the name is too long. Choose a shorter one.",
+        122: "the disk quota is used up. Free some space; what was finished is kept.",
+    }
+    known = remedies.get(error.errno or 0) or remedies.get(type(error))
+    return known or f"{error.strerror or error}. Check the path and the disk."
+
+
+def cache_folder() -> Path:
+    """Where compiled programs are kept."""
+    named = os.environ.get("PERFCONTROL_CACHE")
+    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return Path(named) if named else base / "perfcontrol"
+
+
+def configure_jax() -> None:
+    """Double precision, one host device a core, compiled programs kept on disk."""
+    import jax
+
+    from perfcontrol._cache import cache
+    from perfcontrol._checks import InputError
+
+    jax.config.update("jax_enable_x64", True)
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if "host_platform_device_count" not in os.environ.get("XLA_FLAGS", ""):
+        with contextlib.suppress(RuntimeError):  # JAX runs already, called from a program of its own: keep its devices
+            jax.config.update("jax_num_cpu_devices", cores)
+    if _Cache.wanted and not jax.config.jax_compilation_cache_dir:  # type: ignore[attr-defined]
+        try:
+            cache(cache_folder())
+        except InputError as error:
+            errors.print(f"note: compiled programs are not kept: {error}", markup=False, highlight=False)
+
+
+def shown(value: Any) -> str:
+    """A table cell."""
+    if value is None:
+        return "unknown"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return value if isinstance(value, str) else f"{value:.3g}"
