@@ -99,3 +99,71 @@ NUMBERS = {  # what is not finite, and the remedy that fits
 def test_number_that_is_not_finite_meets_a_remedy_that_fits(case):
     call, name, *words = NUMBERS[case]
     assert_refused(call, name, *words)
+
+
+def broken(*arguments):
+    raise KeyError("prices")
+
+
+def branching(M):
+    return 1.0 if M.sum() > 0 else 2.0
+
+
+SHAPE = "M of shape (1, 2, 2)"
+MAPS = {  # what fails inside a user's own function: the argument it was passed as, and what it was given
+    "scale": (lambda: build(perturbation=pc.DensePerturbation(broken)), "scale", SHAPE, "lifted policy"),
+    "mean": (lambda: build(perturbation=pc.DensePerturbation(1.0, mean=broken)), "mean", SHAPE),
+    "direction": (lambda: build(perturbation=pc.DirectionalPerturbation(eye[None], broken)), "scale", SHAPE),
+    "probabilities": (
+        lambda: build(perturbation=pc.FinitePerturbation(eye[None], broken)),
+        "probabilities",
+        SHAPE,
+    ),
+    "noise": (lambda: build(noise=broken), "noise", SHAPE),
+    "parameters": (lambda: build(noise=pc.Function(broken, 1.0)), "noise", SHAPE),
+    "sampler": (lambda: build(perturbation=pc.SampledPerturbation(broken)), "sampler", "a key", SHAPE),
+    "cost": (lambda: build(cost=pc.ConvexCost(broken)), "function", "t, x of shape (2,), u of shape (2,)"),
+    "record": (
+        lambda: pc.solve(build(), pc.StablePoint(), record=broken),
+        "record",
+        "free_parameters of shape (1, 2, 2)",
+    ),
+    "step": (lambda: pc.solve(build(), pc.RSGD(3, broken, gradient=pc.Exact())), "step_size", "accept n"),
+}
+
+
+@pytest.mark.parametrize("case", MAPS)
+def test_error_inside_a_function_of_the_user_says_which_one_with_what_it_was_given_and_its_cause(case):
+    call, name, *words = MAPS[case]
+    assert_refused(call, name, "KeyError from it", "'prices'", "Its own error stands above", *words)
+    with pytest.raises(pc.InputError) as caught:
+        call()
+    assert isinstance(caught.value.__cause__, KeyError)
+
+
+def test_function_that_looks_at_numbers_while_it_is_compiled_is_told_how_to_be_written():
+    assert_refused(
+        lambda: build(perturbation=pc.DensePerturbation(branching)), "scale", "TracerBool", "jnp.where instead of if"
+    )
+    assert_refused(lambda: build(noise=lambda M: pc.Rademacher(float(M[0, 0, 0]))), "noise", "jax.numpy")
+
+
+def test_error_of_the_package_inside_a_function_of_the_user_keeps_its_argument_and_notes_the_function():
+    with pytest.raises(pc.InputError, match="`value` must be a vector") as caught:
+        build(noise=lambda M: pc.Constant(M))
+    assert "Raised inside `noise`, which was given M of shape (1, 2, 2)." in caught.value.__notes__
+
+
+def test_value_of_a_users_function_that_is_no_array_or_no_number_is_refused():
+    assert_refused(lambda: build(perturbation=pc.DensePerturbation(lambda M: "high")), "scale", "TypeError")
+    steps = pc.RSGD(3, lambda n: np.ones(2), gradient=pc.Exact())
+    assert_refused(lambda: pc.solve(build(), steps), "step_size", "values of shape (2,)")
+    assert_refused(lambda: pc.solve(build(), pc.StablePoint(), record=lambda M: "M"), "record", "TypeError")
+
+
+def test_interruption_inside_a_function_of_the_user_passes():
+    def interrupted(M):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        build(noise=interrupted)

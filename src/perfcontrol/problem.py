@@ -10,8 +10,8 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from perfcontrol._checks import (
-    InputError,
     as_array,
+    call,
     check_instance,
     check_integer,
     check_shape,
@@ -142,7 +142,10 @@ class PerformativeProblem(eqx.Module):
             self._check_reacting_noise()
 
     def _law(self, name: str, law: Any, size: int) -> AbstractRandomVector:
-        law = check_instance(name, law, AbstractRandomVector, "pc.Gaussian(mean, covariance)")
+        example = "pc.Gaussian(mean, covariance)"
+        if name == "noise":
+            example += "`, or a policy map to one, such as `lambda M: pc.Gaussian(mean(M), covariance)"
+        law = check_instance(name, law, AbstractRandomVector, example)
         law = law.resize(size)
         if law.size != size:
             raise fail(name, f"dimension {law.size}", f"have dimension n = {size}", "One entry per state.")
@@ -160,28 +163,18 @@ class PerformativeProblem(eqx.Module):
         policy = jax.ShapeDtypeStruct(self.lifted_shape, self.dtype)
 
         def moments(M: Array) -> tuple[Array, Array]:
-            law = self._law("noise", self.noise(M), self.state_size)  # type: ignore[operator]
+            law = self._law("noise", call("noise", self.noise, M=M), self.state_size)  # type: ignore[arg-type]
             return law.mean, law.covariance
 
-        try:
-            jax.eval_shape(moments, policy)
-            if is_concrete(self.system.A):
-                moments(self.structure.lift(self.initial_policy()))
-        except (TypeError, ValueError) as error:
-            if isinstance(error, InputError) and not isinstance(error, TypeError):  # about the law, not the call
-                raise
-            raise fail(
-                "noise",
-                f"an error from the policy map ({error})",
-                f"accept a policy of shape {self.lifted_shape} and return a law",
-                "Policy maps receive the lifted policy (memory, input, state).",
-            ) from error
+        jax.eval_shape(moments, policy)
+        if is_concrete(self.system.A):
+            moments(self.structure.lift(self.initial_policy()))
 
     def noise_under(self, deployed: Array) -> AbstractRandomVector:
         """The law of w_t in the world that reacts to the lifted policy `deployed`."""
         if isinstance(self.noise, AbstractRandomVector):
             return self.noise
-        return self.noise(deployed).resize(self.state_size)
+        return call("noise", self.noise, M=deployed).resize(self.state_size)
 
     @property
     def noise_reacts(self) -> bool:

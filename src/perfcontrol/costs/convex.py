@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from perfcontrol._checks import as_array, as_callable, fail, is_concrete
+from perfcontrol._checks import as_array, as_callable, call, fail, is_concrete
 from perfcontrol.costs.base import AbstractCost, as_discount, stage_factors
 from perfcontrol.costs.convexity import check_convexity
 
@@ -72,15 +72,7 @@ class ConvexCost(AbstractCost):
         dtype = jnp.result_type(float)
         t = jax.ShapeDtypeStruct((), jnp.result_type(int))
         x, u = jax.ShapeDtypeStruct((state_size,), dtype), jax.ShapeDtypeStruct((input_size,), dtype)
-        try:
-            value = jax.eval_shape(lambda t, x, u: jnp.asarray(self.function(t, x, u)), t, x, u)
-        except (TypeError, ValueError) as error:
-            raise fail(
-                "function",
-                f"an error from it ({error})",
-                f"accept t, x of shape ({state_size},) and u of shape ({input_size},)",
-                "Write it in jax.numpy, for one stage; t is traced: use jnp.where, not if.",
-            ) from error
+        value = jax.eval_shape(self._stage, t, x, u)
         if value.shape != () or not jnp.issubdtype(value.dtype, jnp.floating):
             got = f"{value.dtype} of shape {value.shape}"
             raise fail("function", got, "return one real number", "Sum over the components of x and u.")
@@ -99,14 +91,20 @@ class ConvexCost(AbstractCost):
         times = np.repeat(np.arange(length), 2 * count)
         check_convexity(self.function, constants, times, points[:, : x.shape[2]], points[:, x.shape[2] :])
 
+    def _stage(self, t: Array, x: Array, u: Array) -> Array:
+        return call("function", lambda t, x, u: jnp.asarray(self.function(t, x, u)), t=t, x=x, u=u)
+
+    def _slopes(self, t: Array, x: Array, u: Array) -> tuple[Array, Array]:
+        return call("function", jax.grad(self.function, argnums=(1, 2)), t=t, x=x, u=u)
+
     def _times(self, x: Array) -> Array:
         return jnp.arange(x.shape[0])
 
     def path_cost(self, x: Array, u: Array) -> Array:
-        return self._discounted(jax.vmap(self.function)(self._times(x), x, u))
+        return self._discounted(jax.vmap(self._stage)(self._times(x), x, u))
 
     def path_gradients(self, x: Array, u: Array) -> tuple[Array, Array]:
-        by_state, by_input = jax.vmap(jax.grad(self.function, argnums=(1, 2)))(self._times(x), x, u)
+        by_state, by_input = jax.vmap(self._slopes)(self._times(x), x, u)
         return self._discounted(by_state), self._discounted(by_input)
 
     def _discounted(self, values: Array) -> Array:

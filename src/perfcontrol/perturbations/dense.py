@@ -115,7 +115,7 @@ class DensePerturbation(AbstractPerturbation):
 
     def scales(self, M: Array, horizon: int) -> Array:
         """scale(M) entry by entry, (T, n, p)."""
-        values = as_array("scale", evaluate_map(self.scale, M))
+        values = as_array("scale", evaluate_map(self.scale, M, "scale"))
         if values.ndim == 1:
             values = values[:, None, None]
         return jnp.broadcast_to(values, (horizon, *self._shape(M)))
@@ -139,7 +139,7 @@ class DensePerturbation(AbstractPerturbation):
     def _location(self, M: Array, horizon: int) -> Array:
         if self.mean_map is None:
             return zero_mean(M, horizon, self._shape(M)[1])
-        return jnp.broadcast_to(evaluate_map(self.mean_map, M), (horizon, *self._shape(M)))
+        return jnp.broadcast_to(evaluate_map(self.mean_map, M, "mean"), (horizon, *self._shape(M)))
 
     def mean(self, M: Array, horizon: int) -> Array:
         location = self._location(M, horizon)

@@ -25,15 +25,7 @@ def check_values(
 ) -> None:
     """Raise unless the map accepts a lifted policy and its values have one of the allowed shapes."""
     policy = jax.ShapeDtypeStruct(policy_shape, dtype)
-    try:
-        shape = jax.eval_shape(evaluate_map, policy_map, policy).shape
-    except (TypeError, ValueError) as error:
-        raise fail(
-            name,
-            f"an error from the policy map ({error})",
-            f"accept a policy of shape {policy_shape}",
-            "Policy maps receive the lifted policy (memory, input, state).",
-        ) from error
+    shape = jax.eval_shape(lambda value, M: evaluate_map(value, M, name), policy_map, policy).shape
     if shape not in allowed:
         raise fail(
             name,

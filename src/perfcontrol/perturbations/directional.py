@@ -125,7 +125,7 @@ class DirectionalPerturbation(AbstractPerturbation):
 
     def scales(self, M: Array, horizon: int) -> Array:
         """scale(M), shape (T, k)."""
-        return jnp.broadcast_to(evaluate_map(self.scale, M), (horizon, self.directions.shape[0]))
+        return jnp.broadcast_to(evaluate_map(self.scale, M, "scale"), (horizon, self.directions.shape[0]))
 
     def sample(self, key: Key[Array, ""], M: Array, horizon: int) -> Draws:
         scales = self.scales(M, horizon)
@@ -136,7 +136,7 @@ class DirectionalPerturbation(AbstractPerturbation):
     def mean(self, M: Array, horizon: int) -> Array:
         if self.mean_map is None:
             return zero_mean(M, horizon, self.directions.shape[-1])
-        return jnp.broadcast_to(evaluate_map(self.mean_map, M), (horizon, *self.directions.shape[1:]))
+        return jnp.broadcast_to(evaluate_map(self.mean_map, M, "mean"), (horizon, *self.directions.shape[1:]))
 
     def mean_operator(self, M: Array, horizon: int) -> Array | None:
         return None if self.mean_map is None else self.mean(M, horizon)

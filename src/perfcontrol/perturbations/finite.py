@@ -113,7 +113,7 @@ class FinitePerturbation(AbstractPerturbation):
 
     def distribution(self, M: Array, horizon: int) -> Array:
         """probabilities(M), (T, k); NaN at times where they are no distribution."""
-        values = jnp.broadcast_to(evaluate_map(self.probabilities, M), (horizon, self._count))
+        values = jnp.broadcast_to(evaluate_map(self.probabilities, M, "probabilities"), (horizon, self._count))
         return jnp.where(_is_distribution(values)[:, None], values, jnp.nan)
 
     def sample(self, key: Key[Array, ""], M: Array, horizon: int) -> Draws:

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Key
 
-from perfcontrol._checks import as_array, as_callable, check_nonnegative, fail
+from perfcontrol._checks import as_array, as_callable, call, check_nonnegative, fail
 from perfcontrol.perturbations.base import AbstractPerturbation, CovarianceOperator, DenseDraws, Draws
 
 
@@ -40,15 +40,10 @@ class SampledPerturbation(AbstractPerturbation):
     def _shape(self, policy_shape: tuple[int, int, int]) -> tuple[int, ...]:
         policy = jax.ShapeDtypeStruct(policy_shape, jnp.result_type(float))
         key = jax.eval_shape(lambda: jax.random.key(0))
-        try:
-            return eqx.filter_eval_shape(lambda sampler, key, M: sampler(key, M), self.sampler, key, policy).shape
-        except (TypeError, ValueError, AttributeError) as error:
-            raise fail(
-                "sampler",
-                f"an error from it ({error})",
-                f"accept a key and a policy of shape {policy_shape} and return an array",
-                "It receives the lifted policy (memory, input, state).",
-            ) from error
+        return eqx.filter_eval_shape(lambda law, key, M: law._draw(key, M), self, key, policy).shape
+
+    def _draw(self, key: Key[Array, ""], M: Array) -> Array:
+        return call("sampler", lambda key, M: jnp.asarray(self.sampler(key, M)), key=key, M=M)
 
     def resize(self, policy_shape: tuple[int, int, int], horizon: int) -> "SampledPerturbation":
         """This law knowing how many columns its draws have."""
@@ -74,7 +69,7 @@ class SampledPerturbation(AbstractPerturbation):
                 raise fail(name, f"{value.shape}", f"be a number or have shape (T,) = ({horizon},)", "One per step.")
 
     def sample(self, key: Key[Array, ""], M: Array, horizon: int) -> Draws:
-        return DenseDraws(self.sampler(key, M).astype(M.dtype))
+        return DenseDraws(self._draw(key, M).astype(M.dtype))
 
     def mean(self, M: Array, horizon: int) -> None:
         return None

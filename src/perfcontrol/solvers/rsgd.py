@@ -7,14 +7,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from perfcontrol._checks import check_integer, check_parentheses, fail
+from perfcontrol._checks import call, check_integer, check_parentheses, fail
 from perfcontrol._programs import Numbers, choose
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.solvers.base import AbstractSolver, State, start
 from perfcontrol.solvers.gradients import Pathwise
 from perfcontrol.solvers.result import Result
 from perfcontrol.solvers.schedules import Greedy
-from perfcontrol.solvers.step_sizes import as_step_size
+from perfcontrol.solvers.step_sizes import as_step_size, size_of
 
 DIVERGENCE = 1e8  # growth of ‖M‖ over 1 + ‖M_0‖ at which a run is called divergent
 
@@ -90,7 +90,7 @@ class RSGD(AbstractSolver):
         self.gradient.check(problem)
 
     def init(self, problem: PerformativeProblem, M0: Array) -> State:
-        transform_state = None if self.transform is None else self.transform.init(M0)
+        transform_state = None if self.transform is None else call("transform", self.transform.init, M0=M0)
         threshold = DIVERGENCE * (1 + jnp.sqrt(jnp.sum(M0**2)))
         return start(M0, _Own(jnp.zeros((), int), jnp.zeros((), int), M0, threshold, transform_state))
 
@@ -101,8 +101,10 @@ class RSGD(AbstractSolver):
         gradient = self.gradient(problem, M, deployed, key, self.batch)
         transform_state = own.transform_state
         if self.transform is not None:
-            gradient, transform_state = self.transform.update(gradient, transform_state, M)
-        following = problem.feasible_set.project(M - self.step_size(own.count).astype(M.dtype) * gradient)
+            gradient, transform_state = call(
+                "transform", self.transform.update, gradient=gradient, state=transform_state, policy=M
+            )
+        following = problem.feasible_set.project(M - size_of(self.step_size, own.count).astype(M.dtype) * gradient)
         finite = jnp.all(jnp.isfinite(following))
         diverged = jnp.sqrt(jnp.sum(following**2)) > own.threshold
         good = finite & ~diverged

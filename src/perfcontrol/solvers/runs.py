@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from perfcontrol._checks import call
 from perfcontrol._programs import numerics, on_host, program
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.solvers.base import AbstractSolver, State
@@ -16,6 +17,11 @@ from perfcontrol.solvers.result import Result
 CHUNK = 500  # iterations compiled together: long enough to cost nothing, short enough to stop early
 
 Record = Callable[[Array], Any]
+
+
+def record_of(record: Record, M: Any) -> Any:
+    """What a user's `record` gives at a policy, as arrays."""
+    return call("record", lambda M: jax.tree.map(jnp.asarray, record(M)), free_parameters=M)
 
 
 def identity(M: Any) -> Any:
@@ -59,7 +65,7 @@ def _run(
             state = iterate(state, first + index)
         else:
             state = jax.lax.fori_loop(0, every, lambda j, s: iterate(s, first + index * every + j), state)
-        return state, record(state.M)
+        return state, record_of(record, state.M)
 
     return jax.lax.scan(block, state, jnp.arange(count // every))
 
@@ -72,7 +78,7 @@ def run_steps(
 
 
 _compiled_run = program(_run, on_device=True)
-_compiled_record = program(lambda record, M: record(M))
+_compiled_record = program(record_of)
 _compiled_init = program(lambda solver, problem, M0: solver.init(problem, M0), on_device=True)
 
 
@@ -80,10 +86,10 @@ def traced(run: Run) -> tuple[State, Any]:
     """The whole run inside somebody else's trace."""
     problem, solver, M0, key, total, record, every, _ = run
     state = solver.init(problem, M0)
-    history = [jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], record(M0))]
+    history = [jax.tree.map(lambda leaf: leaf[None], record_of(record, M0))]
     whole = total - total % every
-    state, recorded = _run(solver, problem, state, key, 0, whole, record, every)
-    history.append(recorded)
+    state, kept = _run(solver, problem, state, key, 0, whole, record, every)
+    history.append(kept)
     if total % every:
         state, _ = _run(solver, problem, state, key, whole, total % every, _nothing, 1)
     return state, _joined(history)
@@ -101,8 +107,8 @@ def in_chunks(run: Run) -> tuple[State, Any]:
         whole = count - count % every
         first = np.asarray(done)
         if whole:
-            state, recorded = _compiled_run(solver, problem, state, key, first, whole, record, every)
-            history.append(recorded)
+            state, kept = _compiled_run(solver, problem, state, key, first, whole, record, every)
+            history.append(kept)
         if count - whole:
             state, _ = _compiled_run(solver, problem, state, key, first + whole, count - whole, _nothing, 1)
         done += count

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from perfcontrol._checks import as_array, check_parentheses, fail, is_concrete
+from perfcontrol._checks import as_array, call, check_parentheses, fail, is_concrete
 
 
 class InverseStep(eqx.Module):
@@ -54,6 +54,14 @@ class _FunctionStep(eqx.Module):
 
     def __call__(self, n: Array) -> Array:
         return jnp.asarray(self.function(n))
+
+
+def size_of(rule: Any, n: Array) -> Array:
+    """η_n as a scalar."""
+    size = call("step_size", lambda n: jnp.asarray(rule(n)), n=n)
+    if size.shape:
+        raise fail("step_size", f"values of shape {size.shape}", "give one number for each n", "Return a scalar.")
+    return size
 
 
 def as_step_size(value: Any) -> Any:
