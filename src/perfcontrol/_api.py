@@ -82,7 +82,7 @@ from perfcontrol.solvers import (
     StablePoint,
     solve,
 )
-from perfcontrol.systems import LinearSystem, design_gain
+from perfcontrol.systems import LinearSystem, UnstableGainWarning, design_gain
 from perfcontrol.theory import (
     AbstractCertificateKind,
     Certificate,
@@ -167,6 +167,7 @@ __all__ = [
     "TruncatedGaussian",
     "Unconstrained",
     "Uniform",
+    "UnstableGainWarning",
     "best_response",
     "cache",
     "certify",

@@ -25,7 +25,7 @@ from perfcontrol.perturbations import AbstractPerturbation, NoPerturbation
 from perfcontrol.policy_maps import AbstractPolicyMap, as_policy_map
 from perfcontrol.random_vectors import AbstractRandomVector, Constant, Sequence
 from perfcontrol.sets import AbstractSet, AbstractStructure, FullStructure, LiftedSet, Unconstrained
-from perfcontrol.systems import LinearSystem
+from perfcontrol.systems import LinearSystem, warn_of_growth
 
 
 class PerformativeProblem(eqx.Module):
@@ -271,3 +271,10 @@ def check_problem(problem: Any) -> PerformativeProblem:
     """`problem` itself; raises InputError for anything else."""
     example = "pc.PerformativeProblem(system=..., horizon=..., noise=..., cost=...)"
     return check_instance("problem", problem, PerformativeProblem, example)
+
+
+def warn_of_unstable_gain(problem: PerformativeProblem) -> None:
+    """Say so, once, where a gain was given and the closed loop grows under it nevertheless."""
+    if problem.has_gain:
+        gain = problem.gain if problem.gain.ndim == 2 else problem.gain[:-1]
+        warn_of_growth(problem.system.A, problem.system.B, gain)

@@ -36,7 +36,7 @@ class CostToGo(eqx.Module):
 
     Lambda: Float[Array, "T1 n n"]
     R: Float[Array, "*steps m m"]
-    N: Float[Array, "*steps m n"] | None
+    N: Float[Array, "*between m n"] | None
     S: Float[Array, "T1 m m"]
     D: Float[Array, "T1 m n"]
     F: Matrix

@@ -11,7 +11,7 @@ from jaxtyping import Array
 
 from perfcontrol._checks import check_instance, check_integer, check_key, fail, is_concrete
 from perfcontrol._programs import on_host
-from perfcontrol.problem import PerformativeProblem, check_problem
+from perfcontrol.problem import PerformativeProblem, check_problem, warn_of_unstable_gain
 from perfcontrol.solvers.base import AbstractSolver, Solution, SolveError
 from perfcontrol.solvers.result import Result
 from perfcontrol.solvers.runs import Record, Run, from_host, identity, in_chunks, traced
@@ -64,6 +64,7 @@ def solve(
             "lie in the feasible set",
             "Pass problem.feasible_set.project(M0), or leave M0 out.",
         )
+    warn_of_unstable_gain(problem)
     run = Run(problem, solver, M0, key, total, identity if record is None else record, every, progress)
     stopped = max_steps is not None and max_steps < solver.max_steps
     if not concrete:

@@ -4,7 +4,7 @@ from typing import Any
 
 from perfcontrol._calls import check_keywords
 from perfcontrol._checks import check_parentheses, fail
-from perfcontrol.problem import PerformativeProblem, check_problem
+from perfcontrol.problem import PerformativeProblem, check_problem, warn_of_unstable_gain
 from perfcontrol.theory.certificates.certificate import Certificate
 from perfcontrol.theory.certificates.global_bound import GlobalBound
 from perfcontrol.theory.certificates.kind import AbstractCertificateKind
@@ -53,4 +53,6 @@ def certify(
     References:
         Lemma on existence and uniqueness (paper); docs: theory.
     """
-    return as_kind(kind, settings).assess(check_problem(problem))
+    chosen = as_kind(kind, settings)
+    warn_of_unstable_gain(check_problem(problem))
+    return chosen.assess(problem)
