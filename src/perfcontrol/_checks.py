@@ -1,6 +1,7 @@
 """Input checks with one wording of errors: the argument, what was got, what is required, the remedy."""
 
 import inspect
+import math
 import re
 import warnings
 from collections.abc import Callable, Sequence
@@ -123,21 +124,33 @@ def check_shape(name: str, array: Any, expected: Sequence[int], labels: Sequence
     raise fail(name, f"{tuple(array.shape)}", f"have shape ({axes}) = {expected}", hint)
 
 
+def varies(name: str, got: str) -> InputError:
+    """The error of something that varies in time where there is no last time."""
+    return fail(
+        name,
+        got,
+        "be the same at all times where the horizon is infinite",
+        "Drop its time axis, or pass a finite horizon.",
+    )
+
+
 def check_time_varying(
     name: str,
     array: Array,
     inner: Sequence[int],
     labels: Sequence[str],
-    length: int,
+    length: int | float,
     length_label: str = "time",
 ) -> None:
     """Raise unless `array` has shape `inner` (constant) or `(length, *inner)`."""
     inner = tuple(inner)
+    if array.ndim == len(inner) + 1 and math.isinf(length):
+        raise varies(name, f"shape {tuple(array.shape)}")
     if array.ndim == len(inner) + 1:
         check_shape(
             name,
             array,
-            (length, *inner),
+            (int(length), *inner),
             (length_label, *labels),
             f"A constant of shape {inner} is accepted too." if array.shape[1:] == inner else "",
         )

@@ -1,5 +1,6 @@
 """The performative control problem: everything that the world is, checked together once."""
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -18,12 +19,13 @@ from perfcontrol._checks import (
     check_time_varying,
     fail,
     is_concrete,
+    varies,
 )
 from perfcontrol._linalg import Matrix, along_time
 from perfcontrol.costs import AbstractCost
-from perfcontrol.perturbations import AbstractPerturbation, NoPerturbation
+from perfcontrol.perturbations import AbstractPerturbation, NoPerturbation, fitted_perturbation
 from perfcontrol.policy_maps import AbstractPolicyMap, as_policy_map
-from perfcontrol.random_vectors import AbstractRandomVector, Constant, Sequence
+from perfcontrol.random_vectors import AbstractRandomVector, Constant, Sequence, fitted_vector
 from perfcontrol.sets import AbstractSet, AbstractStructure, FullStructure, LiftedSet, Unconstrained
 from perfcontrol.systems import LinearSystem, warn_of_growth
 
@@ -35,11 +37,12 @@ class PerformativeProblem(eqx.Module):
 
     u_t = -K_t x_t + Σ_{i=1..memory} M[i-1] w_{t-i};
 
-    C_T(M; M') = E Σ_{t=0..T} c_t(x_t, u_t).
+    C_T(M; M') = E Σ_{t=0..T} c_t(x_t, u_t), or lim C_T(M; M') / T where the horizon is infinite.
 
     Args:
         system: A_t and B_t.
-        horizon: T ≥ 1; stages t = 0..T are summed, the terminal one included.
+        horizon: T ≥ 1; stages t = 0..T are summed, the terminal one included. Or `math.inf`: nothing may vary in time,
+            and costs are averages per stage in the long run, on which x_0 has no influence.
         noise: law of w_t, dimension n; or a policy map (a callable, `pc.Function`) from the lifted deployed policy to
             such a law.
         cost: the stage cost.
@@ -65,7 +68,7 @@ class PerformativeProblem(eqx.Module):
     feasible_set: AbstractSet
     initial_state: AbstractRandomVector
     structure: AbstractStructure
-    horizon: int = eqx.field(static=True)
+    horizon: Any = eqx.field(static=True)  # an integer, or math.inf
     memory: int = eqx.field(static=True)
     has_gain: bool = eqx.field(static=True)  # False: K = 0 for certain, and no product with it is computed
 
@@ -73,7 +76,7 @@ class PerformativeProblem(eqx.Module):
         self,
         *,
         system: LinearSystem,
-        horizon: int,
+        horizon: int | float,
         noise: AbstractRandomVector | Callable[[Array], AbstractRandomVector],
         cost: AbstractCost,
         memory: int = 1,
@@ -101,7 +104,7 @@ class PerformativeProblem(eqx.Module):
             "structure", FullStructure() if structure is None else structure, AbstractStructure, "pc.RepeatedBlock(2)"
         )
         n, m = system.state_size, system.input_size
-        self.horizon = check_integer("horizon", horizon, 1)
+        self.horizon = math.inf if horizon == math.inf else check_integer("horizon", horizon, 1)
         self.memory = check_integer("memory", memory, 1)
         if self.memory >= self.horizon:
             raise fail(
@@ -110,6 +113,8 @@ class PerformativeProblem(eqx.Module):
                 f"be below the horizon {self.horizon}",
                 "Shorten the memory or lengthen the horizon.",
             )
+        if not self.is_finite and system.horizon is not None:
+            raise varies("system", f"matrices for {system.horizon} time steps")
         if system.horizon not in (None, self.horizon):
             raise fail(
                 "horizon",
@@ -118,52 +123,31 @@ class PerformativeProblem(eqx.Module):
                 "A_t and B_t are given for t = 0..horizon-1.",
             )
         reacting_noise = callable(noise) and not isinstance(noise, AbstractRandomVector | type)
-        self.noise = as_policy_map("noise", noise) if reacting_noise else self._law("noise", noise, n)  # type: ignore
+        self.noise = as_policy_map("noise", noise) if reacting_noise else fitted_vector("noise", noise, n, self.horizon)
         if isinstance(initial_state, Sequence):
             raise fail("initial_state", "a Sequence", "be one random vector", "Pass an array (n,) or another law.")
-        self.initial_state = self._law(
-            "initial_state",
-            initial_state if isinstance(initial_state, AbstractRandomVector | type) else Constant(initial_state),
-            n,
-        )
-        self.has_gain = not (isinstance(gain, int | float) and gain == 0)
+        start = initial_state if isinstance(initial_state, AbstractRandomVector | type) else Constant(initial_state)
+        self.initial_state = fitted_vector("initial_state", start, n, self.horizon)
         if self.initial_state.mean.ndim == 2:
             raise fail("initial_state", "a law that varies in time", "be one random vector", "Pass one vector (n,).")
+        self.has_gain = not (isinstance(gain, int | float) and gain == 0)
         gain_array = as_array("gain", gain)
         if gain_array.ndim == 0:
             gain_array = jnp.broadcast_to(gain_array, (m, n)) if m == n == 1 else _zero_gain(gain_array, m, n)
         check_time_varying("gain", gain_array, (m, n), ("m", "n"), self.horizon + 1, "T+1")
         self.gain = gain_array
         self.cost.check(n, m, self.horizon)
-        self.perturbation = self.perturbation.resize(self.lifted_shape, self.horizon)
-        self.perturbation.check(self.lifted_shape, self.horizon)
+        self.perturbation = fitted_perturbation(self.perturbation, self.lifted_shape, self.horizon)
         self.feasible_set.check(self.policy_shape)
         if reacting_noise:
             self._check_reacting_noise()
-
-    def _law(self, name: str, law: Any, size: int) -> AbstractRandomVector:
-        example = "pc.Gaussian(mean, covariance)"
-        if name == "noise":
-            example += "`, or a policy map to one, such as `lambda M: pc.Gaussian(mean(M), covariance)"
-        law = check_instance(name, law, AbstractRandomVector, example)
-        law = law.resize(size)
-        if law.size != size:
-            raise fail(name, f"dimension {law.size}", f"have dimension n = {size}", "One entry per state.")
-        if law.mean.ndim == 2 and law.mean.shape[0] != self.horizon:
-            raise fail(
-                name,
-                f"{law.mean.shape[0]} time steps",
-                f"cover the horizon of {self.horizon} steps",
-                "One row for each t = 0..horizon-1.",
-            )
-        return law
 
     def _check_reacting_noise(self) -> None:
         """Build the noise law once at a feasible policy, where values are known, else look at shapes alone."""
         policy = jax.ShapeDtypeStruct(self.lifted_shape, self.dtype)
 
         def moments(M: Array) -> tuple[Array, Array]:
-            law = self._law("noise", call("noise", self.noise, M=M), self.state_size)  # type: ignore[arg-type]
+            law = fitted_vector("noise", call("noise", self.noise, M=M), self.state_size, self.horizon)  # type: ignore[arg-type]
             return law.mean, law.covariance
 
         jax.eval_shape(moments, policy)
@@ -180,6 +164,30 @@ class PerformativeProblem(eqx.Module):
     def noise_reacts(self) -> bool:
         """Whether the law of the noise depends on the deployed policy."""
         return not isinstance(self.noise, AbstractRandomVector)
+
+    @property
+    def is_finite(self) -> bool:
+        """Whether the horizon is."""
+        return self.horizon != math.inf
+
+    @property
+    def steps(self) -> int:
+        """Time steps for which laws and gains are asked: T, or 1 where the horizon is infinite and all are alike."""
+        return self.horizon if self.is_finite else 1
+
+    def truncated(self, horizon: int) -> "PerformativeProblem":
+        """The same problem over a finite horizon T, costs summed over its T+1 stages.
+
+        Args:
+            horizon: T > memory.
+
+        Raises:
+            InputError: an integer is needed; data that vary in time fit no other horizon than their own.
+        """
+        same = ("system", "noise", "cost", "memory", "perturbation", "feasible_set", "initial_state", "structure")
+        parts: dict[str, Any] = {name: getattr(self, name) for name in same}
+        horizon = check_integer("horizon", horizon, 1)
+        return PerformativeProblem(horizon=horizon, gain=self.gain if self.has_gain else 0, **parts)
 
     @property
     def state_size(self) -> int:
@@ -243,8 +251,8 @@ class PerformativeProblem(eqx.Module):
         return u @ self.gain if self.gain.ndim == 2 else jnp.einsum("tmn,tm->tn", self.gain, u)
 
     def gains(self) -> Array:
-        """K_t for t = 0..T, shape (T+1, m, n)."""
-        return along_time(self.gain, 2, self.horizon + 1)
+        """K_t for t = 0..T, shape (T+1, m, n); T is `steps`."""
+        return along_time(self.gain, 2, self.steps + 1)
 
     @property
     def lifted_set(self) -> LiftedSet:
@@ -252,12 +260,12 @@ class PerformativeProblem(eqx.Module):
         return LiftedSet(self.feasible_set, self.structure, self.lifted_shape)
 
     def perturbation_bound(self) -> Array | None:
-        """ξ_t, (T,): almost-sure bound of ‖Δ_t‖ over the feasible set; None if unknown."""
-        return self.perturbation.bound(self.lifted_set, self.horizon)
+        """ξ_t, (T,): almost-sure bound of ‖Δ_t‖ over the feasible set; None if unknown. T is `steps`."""
+        return self.perturbation.bound(self.lifted_set, self.steps)
 
     def sensitivity(self) -> Array | None:
-        """ε_t, (T,), per unit of Frobenius norm of the free parameters; None if unknown."""
-        epsilon = self.perturbation.sensitivity(self.lifted_set, self.horizon)
+        """ε_t, (T,), per unit of Frobenius norm of the free parameters; None if unknown. T is `steps`."""
+        epsilon = self.perturbation.sensitivity(self.lifted_set, self.steps)
         return None if epsilon is None else self.structure.norm * epsilon
 
 
@@ -278,3 +286,10 @@ def warn_of_unstable_gain(problem: PerformativeProblem) -> None:
     if problem.has_gain:
         gain = problem.gain if problem.gain.ndim == 2 else problem.gain[:-1]
         warn_of_growth(problem.system.A, problem.system.B, gain)
+
+
+def check_end(problem: Any) -> PerformativeProblem:
+    """`problem` itself; raises InputError for anything else than a problem with a finite horizon."""
+    if not check_problem(problem).is_finite:
+        raise fail("problem", "an infinite horizon", "have a finite horizon here", "Pass problem.truncated(T).")
+    return problem

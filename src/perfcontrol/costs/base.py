@@ -1,6 +1,7 @@
 """The interface of a stage cost c_t(x, u), summed over t = 0..T."""
 
 import abc
+import math
 from typing import Any
 
 import equinox as eqx
@@ -24,7 +25,7 @@ class AbstractCost(eqx.Module):
         """∇_x c_t and ∇_u c_t along the path."""
 
     @abc.abstractmethod
-    def check(self, state_size: int, input_size: int, horizon: int) -> None:
+    def check(self, state_size: int, input_size: int, horizon: int | float) -> None:
         """Raise InputError where the cost does not fit a problem of that shape."""
 
 
@@ -36,6 +37,13 @@ def as_discount(value: Any) -> Array | None:
     if discount.ndim or (is_concrete(discount) and not 0 < float(discount) <= 1):
         raise fail("discount", f"{value}", "be one number in (0, 1]", "Stage t counts discount^t; 1.0: all alike.")
     return discount
+
+
+def check_discount(discount: Array | None, horizon: int | float) -> None:
+    """Raise where costs are discounted though their average over the long run is asked for."""
+    if discount is not None and math.isinf(horizon):
+        required = "be 1 where the horizon is infinite: the long run does not see what is discounted"
+        raise fail("discount", "another factor", required, "Leave it out, or pass a finite horizon.")
 
 
 def stage_factors(discount: Array, length: int) -> Float[Array, " T1"]:

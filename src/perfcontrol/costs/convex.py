@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from perfcontrol._checks import as_array, as_callable, call, fail, is_concrete
-from perfcontrol.costs.base import AbstractCost, as_discount, stage_factors
+from perfcontrol.costs.base import AbstractCost, as_discount, check_discount, stage_factors
 from perfcontrol.costs.convexity import check_convexity
 
 
@@ -68,7 +68,8 @@ class ConvexCost(AbstractCost):
                 "No function curves more than its gradient allows.",
             )
 
-    def check(self, state_size: int, input_size: int, horizon: int) -> None:
+    def check(self, state_size: int, input_size: int, horizon: int | float) -> None:
+        check_discount(self.discount, horizon)
         dtype = jnp.result_type(float)
         t = jax.ShapeDtypeStruct((), jnp.result_type(int))
         x, u = jax.ShapeDtypeStruct((state_size,), dtype), jax.ShapeDtypeStruct((input_size,), dtype)

@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 
 from perfcontrol._checks import as_array, check_symmetric_psd, check_time_varying, fail
 from perfcontrol._linalg import along_time, transpose
-from perfcontrol.costs.base import AbstractCost, as_discount, stage_factors
+from perfcontrol.costs.base import AbstractCost, as_discount, check_discount, stage_factors
 
 
 class QuadraticForm(NamedTuple):
@@ -88,8 +88,9 @@ class QuadraticCost(AbstractCost):
                 "[[Q, cross], [crossᵀ, R]] must be convex: make `cross` smaller.",
             )
 
-    def check(self, state_size: int, input_size: int, horizon: int) -> None:
+    def check(self, state_size: int, input_size: int, horizon: int | float) -> None:
         n, m, length = state_size, input_size, horizon + 1
+        check_discount(self.discount, horizon)
         shapes = {
             "Q": (self.Q, (n, n), ("n", "n")),
             "R": (self.R, (m, m), ("m", "m")),

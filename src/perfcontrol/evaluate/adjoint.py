@@ -15,13 +15,22 @@ from jaxtyping import Array, Float, Key
 from perfcontrol._checks import check_integer, check_key
 from perfcontrol._linalg import rmatvec
 from perfcontrol._programs import program
-from perfcontrol.evaluate.rollout import Path, Trajectories, check_pair, input_adjoint, input_term, lanes, sample_path
+from perfcontrol.evaluate.rollout import (
+    Path,
+    Trajectories,
+    check_pair,
+    cut_off,
+    input_adjoint,
+    input_term,
+    lanes,
+    sample_path,
+)
 from perfcontrol.policy import feedforward_adjoint
 from perfcontrol.problem import PerformativeProblem
 
 
 def path_gradient(problem: PerformativeProblem, path: Path | Trajectories) -> Array:
-    """∇_M of the cost of an observed path, perturbations and noise held fixed.
+    """∇_M of the cost of an observed path, summed over its stages, perturbations and noise held fixed.
 
     Args:
         problem: the problem.
@@ -34,6 +43,8 @@ def path_gradient(problem: PerformativeProblem, path: Path | Trajectories) -> Ar
     References:
         Appendix B, equation (grad M ct), with the window w_{t-1}, ..., w_{t-H}.
     """
+    if not problem.is_finite:
+        return path_gradient(problem.truncated(path.w.shape[-2]), path)
     if isinstance(path, Trajectories):
 
         def one(single: Trajectories) -> Array:
@@ -102,9 +113,17 @@ _compiled_mean_path_gradient = program(mean_path_gradient, on_device=True)
 
 
 def sample_gradient(
-    problem: PerformativeProblem, M: Any, *, deployed: Any = None, key: Any = None, samples: int = 1
+    problem: PerformativeProblem,
+    M: Any,
+    *,
+    deployed: Any = None,
+    key: Any = None,
+    samples: int = 1,
+    truncation: int | None = None,
 ) -> Array:
     """Mean pathwise gradient ∇_1 C_T(M; deployed): unbiased, from simulated paths.
+
+    On an infinite horizon per stage of paths of `truncation` steps, with a bias of the order 1/truncation.
 
     Args:
         problem: the problem.
@@ -112,13 +131,15 @@ def sample_gradient(
         deployed: likewise, the policy that the world reacts to; None for M itself.
         key: JAX random key; required.
         samples: number of paths.
+        truncation: T of the paths, for an infinite horizon and only there.
 
     Returns:
         Shape `problem.policy_shape`.
 
     Raises:
-        InputError: wrong shapes, a missing key, samples < 1.
+        InputError: wrong shapes, a missing key, samples < 1, an infinite horizon without truncation.
     """
     M, reacting = check_pair(problem, M, deployed)
+    finite, weight = cut_off(problem, truncation)
     samples = check_integer("samples", samples, 1)
-    return _compiled_mean_path_gradient(problem, M, reacting, check_key(key), samples)
+    return weight * _compiled_mean_path_gradient(finite, M, reacting, check_key(key), samples)

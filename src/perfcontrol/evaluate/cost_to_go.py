@@ -14,14 +14,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from perfcontrol._checks import fail
-from perfcontrol._linalg import Matrix, along_time, as_dense, congruence, symmetrise, transpose
+from perfcontrol._linalg import Matrix, along_time, congruence, symmetrise, transpose
 from perfcontrol._programs import program
-from perfcontrol.costs import QuadraticCost
-from perfcontrol.perturbations import CovarianceOperator
+from perfcontrol.evaluate.loop import closed_loop
+from perfcontrol.evaluate.stationary import StationaryWorld, stationary_world
 from perfcontrol.problem import PerformativeProblem
-
-SIMULATE = "Use pc.estimate_cost and pc.sample_gradient, which only simulate."
 
 
 class CostToGo(eqx.Module):
@@ -45,62 +42,11 @@ class CostToGo(eqx.Module):
     noise_covariance: Float[Array, "*times n n"]
 
 
-def require_moments(problem: PerformativeProblem) -> None:
-    """Raise unless the cost is what exact evaluation needs; of the perturbation, `known_covariance` says."""
-    if not isinstance(problem.cost, QuadraticCost):
-        raise fail("cost", type(problem.cost).__name__, "be a QuadraticCost for exact evaluation", SIMULATE)
-
-
-def known_covariance(problem: PerformativeProblem, reacting: Array) -> CovarianceOperator:
-    """The covariance operator of the perturbation; raises where the law does not know it."""
-    spread = problem.perturbation.covariance(reacting, problem.horizon)
-    if spread is None:
-        raise fail(
-            "perturbation",
-            f"{type(problem.perturbation).__name__} without known moments",
-            "know its mean and covariance for exact evaluation",
-            SIMULATE,
-        )
-    return spread
-
-
-def _stage_weights(problem: PerformativeProblem) -> tuple[Array, Array | None, Array]:
-    """The stage weight seen through u = v - K x: on x, (n, n); between v and x, (m, n), None for zero; on v, (m, m).
-
-    Each with a leading axis T+1 where it varies in time.
-    """
-    cost = problem.cost
-    assert isinstance(cost, QuadraticCost)
-    Q, R, cross = cost.weights(problem.horizon)
-    between = None if cross is None else transpose(cross)
-    if not problem.has_gain:
-        return Q, between, R
-    K = problem.gain
-    on_x = Q + transpose(K) @ R @ K
-    if between is None:
-        return on_x, -R @ K, R
-    mixed = transpose(K) @ between
-    return on_x - mixed - transpose(mixed), between - R @ K, R
-
-
 def cost_to_go(problem: PerformativeProblem, reacting: Array) -> CostToGo:
     """The backward recursion under the lifted deployed policy `reacting`."""
-    n, m, T = problem.state_size, problem.input_size, problem.horizon
-    on_x, between, on_v = _stage_weights(problem)
-    A, B = problem.system.A, problem.system.B
-    on_input = problem.perturbation.columns(n, m) > n
-    Theta = problem.perturbation.mean_operator(reacting, T)
-    if Theta is not None and on_input:
-        joint = as_dense(Theta)
-        A, B = A + joint[..., :n], B + joint[..., n:]
-    elif Theta is not None:
-        A = A + Theta
-    F = problem.closed_loop(A, B)
-    varying = F.ndim == 3
-    spread = known_covariance(problem, reacting)
-    K = problem.gains()[:-1]
-    state_part = jnp.concatenate([jnp.broadcast_to(jnp.eye(n, dtype=K.dtype), (T, n, n)), -K], axis=1)
-
+    n, T = problem.state_size, problem.horizon
+    F, B, on_x, between, on_v, spread, state_part = closed_loop(problem, reacting)
+    varying, on_input = F.ndim == 3, state_part is not None
     spread_steps, backward = (spread.steps, None) if varying or on_input else spread.backward(F)
 
     def retreat(Lambda: Array, step: Any) -> tuple[Array, Array]:
@@ -116,10 +62,10 @@ def cost_to_go(problem: PerformativeProblem, reacting: Array) -> CostToGo:
 
     last = symmetrise(on_x if on_x.ndim == 2 else on_x[-1])
     stages = on_x[:-1] if on_x.ndim == 3 else None
-    steps = (F if varying else None, stages, spread_steps, state_part if on_input else None)
+    steps = (F if varying else None, stages, spread_steps, state_part)
     _, earlier = jax.lax.scan(retreat, last, steps, reverse=True)
     Lambda = jnp.concatenate([earlier, last[None]])
-    if on_input:
+    if state_part is not None:
         reaction = spread.adjoint(Lambda[1:])[:, n:, :]
         last_stage = ((0, 1), (0, 0), (0, 0))  # nothing reacts after it
         on_v = on_v + jnp.pad(reaction[:, :, n:], last_stage)
@@ -138,7 +84,11 @@ def cost_to_go(problem: PerformativeProblem, reacting: Array) -> CostToGo:
     return CostToGo(Lambda, on_v, between, S, D, F, B, noise.mean, noise.covariance)
 
 
+World = CostToGo | StationaryWorld
+
+
 @program(on_device=True)  # what works with it are programs, too
-def world_of(problem: PerformativeProblem, deployed: Any) -> CostToGo:
-    """`cost_to_go` of the deployed policy's free parameters."""
-    return cost_to_go(problem, problem.structure.lift(deployed))
+def world_of(problem: PerformativeProblem, deployed: Any) -> World:
+    """The world that the deployed policy's free parameters make: `cost_to_go`, or its stationary limit."""
+    make = cost_to_go if problem.is_finite else stationary_world
+    return make(problem, problem.structure.lift(deployed))

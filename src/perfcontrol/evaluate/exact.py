@@ -8,22 +8,29 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from perfcontrol._checks import check_finite, fail
 from perfcontrol._linalg import along_time
-from perfcontrol._programs import program
-from perfcontrol.evaluate.cost_to_go import CostToGo, require_moments, world_of
+from perfcontrol._programs import known, program
+from perfcontrol.evaluate.cost_to_go import World, world_of
 from perfcontrol.evaluate.impulses import constant_impulses, varying_impulses
+from perfcontrol.evaluate.loop import require_moments
 from perfcontrol.evaluate.mean_path import mean_path
 from perfcontrol.evaluate.rollout import check_pair
+from perfcontrol.evaluate.stationary import StationaryWorld, mean_square_radius, mean_stage
 from perfcontrol.policy import feedforward, feedforward_adjoint
 from perfcontrol.problem import PerformativeProblem
 
 
-def cost_and_gradient(problem: PerformativeProblem, world: CostToGo, policy: Array) -> tuple[Array, Array]:
-    """C_T and ∇_1 C_T at a lifted policy, given the world that the deployed policy makes."""
+def cost_and_gradient(problem: PerformativeProblem, world: World, policy: Array) -> tuple[Array, Array]:
+    """C_T and ∇_1 C_T at a lifted policy, given the world that the deployed policy makes; per stage in the limit."""
     covariance, mean = world.noise_covariance, world.noise_mean
+    if isinstance(world, StationaryWorld):
+        cost, gradient = constant_impulses(world, policy, covariance)
+        deterministic, by_v = mean_stage(problem, world, jnp.sum(policy, axis=0) @ mean)
+        return cost + deterministic, gradient + jnp.outer(by_v, mean)
     impulses = constant_impulses if covariance.ndim == 2 else varying_impulses
     cost, gradient = impulses(world, policy, covariance)
     w = along_time(mean, 1, problem.horizon)
@@ -33,7 +40,7 @@ def cost_and_gradient(problem: PerformativeProblem, world: CostToGo, policy: Arr
 
 
 @program
-def weigh(problem: PerformativeProblem, world: CostToGo, M: Any) -> tuple[Array, Array]:
+def weigh(problem: PerformativeProblem, world: World, M: Any) -> tuple[Array, Array]:
     """`cost_and_gradient` of free parameters, the gradient by them."""
     cost, gradient = cost_and_gradient(problem, world, problem.structure.lift(M))
     return cost, problem.structure.adjoint(gradient)
@@ -55,8 +62,23 @@ def total_gradient(problem: PerformativeProblem, M: Any) -> Array:
     return jax.grad(lambda policy: exact_cost(problem, policy, policy))(M)
 
 
+def check_answer(what: str, answer: Any, problem: PerformativeProblem, deployed: Any) -> Array:
+    """`answer` where it is finite (or traced); else the error that says why it is not."""
+    if problem.is_finite or not known(answer, problem, deployed) or np.all(np.isfinite(answer)):
+        return jnp.asarray(check_finite(what, answer))
+    radius = float(mean_square_radius(problem, deployed))
+    raise fail(
+        "deployed",
+        f"a policy under which second moments grow by the factor {radius:.6g} a stage (spectral radius)",
+        "keep the world mean-square stable, with a spectral radius below 1",
+        "Deploy a policy of smaller norm, or use a stabilising gain, as of pc.design_gain.",
+    )
+
+
 def expected_cost(problem: PerformativeProblem, M: Any, *, deployed: Any = None) -> Array:
     """Exact C_T(M; deployed) = E Σ_{t=0..T} c_t(x_t, u_t); `deployed=None` means M: the performative cost.
+
+    With `horizon=math.inf` the average cost per stage in the long run.
 
     Beware: `jax.grad(lambda M: expected_cost(problem, M))` differentiates in both policies, which is the gradient
     of the performative optimum, not the one that performative stability is about. See `expected_gradient`.
@@ -70,11 +92,13 @@ def expected_cost(problem: PerformativeProblem, M: Any, *, deployed: Any = None)
         A scalar.
 
     Raises:
-        InputError: wrong shapes, a cost or perturbation without closed moments.
+        InputError: wrong shapes, a cost or perturbation without closed moments; on an infinite horizon a deployed
+            policy whose world is not mean-square stable.
+        OverflowError: the answer is too large for the precision of the problem.
     """
     M, reacting = check_pair(problem, M, deployed)
     require_moments(problem)
-    return jnp.asarray(check_finite("the expected cost", exact_cost(problem, M, reacting)))
+    return check_answer("the expected cost", exact_cost(problem, M, reacting), problem, reacting)
 
 
 def expected_gradient(problem: PerformativeProblem, M: Any, *, deployed: Any = None, total: bool = False) -> Array:
@@ -98,7 +122,7 @@ def expected_gradient(problem: PerformativeProblem, M: Any, *, deployed: Any = N
     M, reacting = check_pair(problem, M, deployed)
     require_moments(problem)
     if not total:
-        return jnp.asarray(check_finite("the expected gradient", exact_gradient(problem, M, reacting)))
+        return check_answer("the expected gradient", exact_gradient(problem, M, reacting), problem, reacting)
     if deployed is not None:
         raise fail(
             "deployed",
@@ -106,4 +130,4 @@ def expected_gradient(problem: PerformativeProblem, M: Any, *, deployed: Any = N
             "be left out for the total gradient",
             "The total derivative moves both policies together.",
         )
-    return jnp.asarray(check_finite("the total gradient", total_gradient(problem, M)))
+    return check_answer("the total gradient", total_gradient(problem, M), problem, M)

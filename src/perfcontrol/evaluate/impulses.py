@@ -9,11 +9,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from perfcontrol._linalg import Matrix, along_time, as_dense, transpose
-from perfcontrol.evaluate.cost_to_go import CostToGo
+from perfcontrol.evaluate.cost_to_go import CostToGo, World
+from perfcontrol.evaluate.stationary import StationaryWorld
 
 
 class ImpulseForm(eqx.Module):
-    """Σ_s of the quadratic forms that impulses w_s meet, for noise whose covariance is constant.
+    """Σ_s of the quadratic forms that impulses w_s meet, for noise whose covariance is constant; of one in the limit.
 
     G: (H m, H m), F: (H m, n), a: (n, n): cost tr Σ (a + FᵀM̂ + M̂ᵀF + M̂ᵀG M̂), M̂ the (H m, n) stack of lags.
     """
@@ -73,15 +74,18 @@ def _chain_tails(world: CostToGo, memory: int) -> tuple[Array, Array]:
     return jnp.stack(X), jnp.stack([y[d] for d, y in enumerate(Y)])
 
 
-def impulse_form(world: CostToGo, memory: int) -> ImpulseForm:
-    """The blocks summed over impulses, by tail sums over time."""
+def impulse_form(world: World, memory: int) -> ImpulseForm:
+    """The blocks summed over impulses, by tail sums over time; in the stationary limit those of one impulse."""
     m = world.S.shape[-1]
-    X, Y = _chain_tails(world, memory)
+    if isinstance(world, StationaryWorld):
+        (X, Y), a = world.chains(memory), world.Lambda
+    else:
+        (X, Y), a = _chain_tails(world, memory), jnp.sum(world.Lambda[1:], axis=0)
     row, column = jnp.meshgrid(jnp.arange(memory), jnp.arange(memory), indexing="ij")
     blocks = X[jnp.abs(row - column), jnp.maximum(row, column)]
     blocks = jnp.where((row >= column)[..., None, None], blocks, transpose(blocks))
     G = blocks.transpose(0, 2, 1, 3).reshape(memory * m, memory * m)
-    return ImpulseForm(G, Y.reshape(memory * m, -1), jnp.sum(world.Lambda[1:], axis=0))
+    return ImpulseForm(G, Y.reshape(memory * m, -1), a)
 
 
 def varying_impulses(world: CostToGo, M: Array, covariance: Array) -> tuple[Array, Array]:
@@ -109,7 +113,7 @@ def varying_impulses(world: CostToGo, M: Array, covariance: Array) -> tuple[Arra
     return constant + jnp.sum(M * (2 * linear_all + curved_all)), 2 * (linear_all + curved_all)
 
 
-def constant_impulses(world: CostToGo, M: Array, covariance: Array) -> tuple[Array, Array]:
+def constant_impulses(world: World, M: Array, covariance: Array) -> tuple[Array, Array]:
     """Cost and gradient (H, m, n) of the impulses where the noise covariance (n, n) is constant."""
     form = impulse_form(world, M.shape[0])
     stacked = M.reshape(-1, M.shape[-1])

@@ -11,9 +11,10 @@ from jaxtyping import Array
 
 from perfcontrol._linalg import along_time, as_dense, matvec, rmatvec
 from perfcontrol.costs import QuadraticCost
-from perfcontrol.evaluate.cost_to_go import CostToGo
+from perfcontrol.evaluate.cost_to_go import CostToGo, World
 from perfcontrol.evaluate.impulses import tail_sums
 from perfcontrol.evaluate.rollout import input_adjoint, input_term
+from perfcontrol.evaluate.stationary import StationaryWorld
 from perfcontrol.problem import PerformativeProblem
 
 
@@ -61,8 +62,10 @@ def mean_path(problem: PerformativeProblem, world: CostToGo, v: Array, w: Array,
     return total, 2 * by_v
 
 
-def sustained_form(world: CostToGo, memory: int) -> Array:
+def sustained_form(world: World, memory: int) -> Array:
     """(H m, H m): the quadratic form that constant feedforwards ṽ_i, held from time i on, meet (i = 1..H)."""
+    if isinstance(world, StationaryWorld):  # in the long run the lags do not differ
+        return jnp.tile(world.sustained(), (memory, memory))
     length, m = world.S.shape[0], world.S.shape[-1]
     active = (jnp.arange(length)[:, None] >= jnp.arange(1, memory + 1)).astype(world.S.dtype)  # (T+1, H)
     B = as_dense(along_time(world.B, 2, length - 1))

@@ -15,10 +15,10 @@ from jaxtyping import Array, Float
 from perfcontrol._checks import check_finite
 from perfcontrol._linalg import along_time, as_dense, symmetrise
 from perfcontrol._programs import program
-from perfcontrol.evaluate.cost_to_go import known_covariance, require_moments
+from perfcontrol.evaluate.loop import known_covariance, require_moments
 from perfcontrol.evaluate.rollout import check_pair
 from perfcontrol.policy import lagged
-from perfcontrol.problem import PerformativeProblem
+from perfcontrol.problem import PerformativeProblem, check_end
 
 
 class StateMoments(eqx.Module):
@@ -137,6 +137,7 @@ def state_moments(problem: PerformativeProblem, M: Any, *, deployed: Any = None)
     """
     M, reacting = check_pair(problem, M, deployed)
     require_moments(problem)
+    check_end(problem)
     return check_finite("the state moments", _compiled_moments(problem, M, reacting))
 
 
@@ -150,4 +151,5 @@ def expected_cost_by_moments(problem: PerformativeProblem, M: Any, *, deployed: 
     """
     M, reacting = check_pair(problem, M, deployed)
     require_moments(problem)
+    check_end(problem)
     return check_finite("the expected cost", _compiled_cost(problem, M, reacting))

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
-from perfcontrol._checks import check_integer, check_key
+from perfcontrol._checks import check_integer, check_key, fail
 from perfcontrol._linalg import Diagonal, Matrix, along_time, matvec
 from perfcontrol._programs import program
 from perfcontrol.perturbations import Draws
@@ -38,7 +38,7 @@ class Trajectories(eqx.Module):
         x: states, (samples, T+1, n).
         u: inputs, (samples, T+1, m).
         w: noise, (samples, T, n).
-        cost: summed over the T+1 stages, (samples,).
+        cost: summed over the T+1 stages, (samples,); averaged over them where an infinite horizon was cut off.
         draws: the perturbations, every leaf with a leading sample axis.
     """
 
@@ -148,8 +148,28 @@ def check_pair(problem: PerformativeProblem, M: Any, deployed: Any) -> tuple[Arr
     return M, M if deployed is None else problem.check_policy("deployed", deployed)
 
 
+def cut_off(problem: PerformativeProblem, truncation: Any) -> tuple[PerformativeProblem, float]:
+    """The problem to simulate, and the weight of its costs: an infinite horizon is cut off, and costs averaged."""
+    if problem.is_finite:
+        if truncation is not None:
+            got = f"{truncation} for a horizon of {problem.horizon}"
+            raise fail("truncation", got, "be left out where the horizon is finite", "Use problem.truncated(T).")
+        return problem, 1.0
+    if truncation is None:
+        required = "say how many steps to simulate where the horizon is infinite"
+        raise fail("truncation", "None", required, "Pass truncation=1000: the bias falls like 1/truncation.")
+    truncation = check_integer("truncation", truncation, 1)
+    return problem.truncated(truncation), 1 / (truncation + 1)
+
+
 def simulate(
-    problem: PerformativeProblem, M: Any, *, deployed: Any = None, key: Any = None, samples: int = 1
+    problem: PerformativeProblem,
+    M: Any,
+    *,
+    deployed: Any = None,
+    key: Any = None,
+    samples: int = 1,
+    truncation: int | None = None,
 ) -> Trajectories:
     """Independent closed-loop paths of the policy M while the world reacts to `deployed` (None: to M itself).
 
@@ -161,18 +181,30 @@ def simulate(
         deployed: likewise, the policy that the world reacts to; None for M itself.
         key: JAX random key; required.
         samples: number of paths.
+        truncation: T of the paths, for an infinite horizon and only there.
 
     Raises:
-        InputError: wrong shapes, a missing key, samples < 1.
+        InputError: wrong shapes, a missing key, samples < 1, an infinite horizon without truncation.
     """
     M, reacting = check_pair(problem, M, deployed)
-    return _simulate(problem, M, reacting, check_key(key), check_integer("samples", samples, 1))
+    finite, weight = cut_off(problem, truncation)
+    paths = _simulate(finite, M, reacting, check_key(key), check_integer("samples", samples, 1))
+    return eqx.tree_at(lambda p: p.cost, paths, weight * paths.cost)
 
 
 def estimate_cost(
-    problem: PerformativeProblem, M: Any, *, deployed: Any = None, key: Any = None, samples: int = 1024
+    problem: PerformativeProblem,
+    M: Any,
+    *,
+    deployed: Any = None,
+    key: Any = None,
+    samples: int = 1024,
+    truncation: int | None = None,
 ) -> Estimate:
     """Monte Carlo estimate of C_T(M; deployed) with its standard error; needs no moments and any cost.
+
+    On an infinite horizon of the average cost per stage over `truncation` steps, x_0 included: its bias, of the order
+    1/truncation, is not in the standard error.
 
     Args:
         problem: the problem.
@@ -180,10 +212,12 @@ def estimate_cost(
         deployed: likewise, the policy that the world reacts to; None for M itself.
         key: JAX random key; required.
         samples: number of paths.
+        truncation: T of the paths, for an infinite horizon and only there.
 
     Raises:
         InputError: as `simulate`; at least two samples are needed for a standard error.
     """
     M, reacting = check_pair(problem, M, deployed)
-    costs = _path_costs(problem, M, reacting, check_key(key), check_integer("samples", samples, 2))
+    finite, weight = cut_off(problem, truncation)
+    costs = weight * _path_costs(finite, M, reacting, check_key(key), check_integer("samples", samples, 2))
     return Estimate(jnp.mean(costs), jnp.std(costs, ddof=1) / jnp.sqrt(samples))

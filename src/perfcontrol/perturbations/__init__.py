@@ -4,6 +4,7 @@ from perfcontrol.perturbations.base import AbstractPerturbation, CovarianceOpera
 from perfcontrol.perturbations.dense import DensePerturbation
 from perfcontrol.perturbations.directional import DirectionalPerturbation
 from perfcontrol.perturbations.finite import FinitePerturbation
+from perfcontrol.perturbations.fitted import fitted_perturbation as fitted_perturbation
 from perfcontrol.perturbations.none import NoPerturbation
 from perfcontrol.perturbations.sampled import SampledPerturbation
 from perfcontrol.perturbations.stock import StockPerturbation

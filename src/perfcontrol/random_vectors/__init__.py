@@ -3,6 +3,7 @@
 from perfcontrol.random_vectors.base import AbstractRandomVector
 from perfcontrol.random_vectors.constant import Constant
 from perfcontrol.random_vectors.empirical import Empirical
+from perfcontrol.random_vectors.fitted import fitted_vector as fitted_vector
 from perfcontrol.random_vectors.gaussian import Gaussian
 from perfcontrol.random_vectors.linear import Linear
 from perfcontrol.random_vectors.rademacher import Rademacher

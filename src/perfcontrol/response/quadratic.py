@@ -12,7 +12,7 @@ from jaxtyping import Array
 
 from perfcontrol._linalg import symmetrise
 from perfcontrol._programs import Numbers, known, numerics, on_host, program
-from perfcontrol.evaluate.cost_to_go import CostToGo
+from perfcontrol.evaluate.cost_to_go import World
 from perfcontrol.evaluate.exact import weigh
 from perfcontrol.evaluate.impulses import impulse_form
 from perfcontrol.evaluate.mean_path import sustained_form
@@ -43,7 +43,7 @@ class Quadratic(eqx.Module):
         return self.linear + (self.matrix @ M.reshape(-1)).reshape(M.shape)
 
 
-def stationary(world: CostToGo) -> bool:
+def stationary(world: World) -> bool:
     """Whether noise mean and covariance are constant in time (known from shapes)."""
     return world.noise_mean.ndim == 1 and world.noise_covariance.ndim == 2
 
@@ -76,7 +76,7 @@ class Factors(NamedTuple):
 _impulse_form, _sustained_form = program(impulse_form), program(sustained_form)
 
 
-def factors(problem: PerformativeProblem, world: CostToGo) -> Factors:
+def factors(problem: PerformativeProblem, world: World) -> Factors:
     """The factors of a given world."""
     form = _impulse_form(world, problem.memory)
     Sigma, w = on_host((world.noise_covariance, world.noise_mean))
@@ -88,7 +88,7 @@ def factors(problem: PerformativeProblem, world: CostToGo) -> Factors:
 
 
 @program
-def quadratic(problem: PerformativeProblem, world: CostToGo) -> Quadratic:
+def quadratic(problem: PerformativeProblem, world: World) -> Quadratic:
     """The quadratic of a given world, its Hessian as a matrix."""
     zero = jnp.zeros(problem.policy_shape, world.S.dtype)
     linear = weigh(problem, world, zero)[1]
@@ -96,7 +96,7 @@ def quadratic(problem: PerformativeProblem, world: CostToGo) -> Quadratic:
     return Quadratic(linear, 1 / _largest_eigenvalue(matrix), matrix)
 
 
-def quadratic_by_passes(problem: PerformativeProblem, world: CostToGo) -> Quadratic:
+def quadratic_by_passes(problem: PerformativeProblem, world: World) -> Quadratic:
     """The same without a matrix."""
 
     def gradient(M: Array) -> Array:
@@ -106,7 +106,7 @@ def quadratic_by_passes(problem: PerformativeProblem, world: CostToGo) -> Quadra
     return Quadratic(linear, 1 / _power_iteration(gradient, linear), None, gradient)
 
 
-def _hessian_matrix(problem: PerformativeProblem, world: CostToGo, linear: Array) -> Array:
+def _hessian_matrix(problem: PerformativeProblem, world: World, linear: Array) -> Array:
     """The Hessian in the free parameters (p, p)."""
     size = linear.size
     if stationary(world):

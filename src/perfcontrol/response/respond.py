@@ -11,15 +11,14 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from perfcontrol._checks import check_finite
 from perfcontrol._linalg import frobenius
 from perfcontrol._programs import known, numerics, on_host, program
-from perfcontrol.evaluate.cost_to_go import CostToGo, require_moments, world_of
-from perfcontrol.evaluate.exact import exact_gradient, weigh
+from perfcontrol.evaluate.cost_to_go import World, world_of
+from perfcontrol.evaluate.exact import check_answer, exact_gradient, weigh
+from perfcontrol.evaluate.loop import require_moments
 from perfcontrol.evaluate.reaction import reaction_jacobian
 from perfcontrol.evaluate.rollout import check_pair
 from perfcontrol.problem import PerformativeProblem, check_problem
@@ -46,19 +45,19 @@ def _held(problem: PerformativeProblem) -> bool:
     return math.prod(problem.policy_shape) <= quadratics.DENSE_LIMIT
 
 
-def _separable(problem: PerformativeProblem, world: CostToGo) -> bool:
+def _separable(problem: PerformativeProblem, world: World) -> bool:
     free = isinstance(problem.feasible_set, Unconstrained) and isinstance(problem.structure, FullStructure)
     return free and stationary(world)
 
 
-def _shape_of_cost(problem: PerformativeProblem, world: CostToGo) -> Any:
+def _shape_of_cost(problem: PerformativeProblem, world: World) -> Any:
     """What the methods need to know of the quadratic; finite unless the world overflows."""
     if _separable(problem, world):
         return factors(problem, world)
     return quadratic(problem, world) if _held(problem) else quadratic_by_passes(problem, world)
 
 
-def _method(problem: PerformativeProblem, world: CostToGo, form: Any) -> Method:
+def _method(problem: PerformativeProblem, world: World, form: Any) -> Method:
     """The cheapest method that is exact for this kind of problem; known from types and shapes alone."""
     if isinstance(form, Factors):
         return _separable_method(problem, world, form)
@@ -67,7 +66,7 @@ def _method(problem: PerformativeProblem, world: CostToGo, form: Any) -> Method:
     return Projected(problem.feasible_set, form)
 
 
-def _separable_method(problem: PerformativeProblem, world: CostToGo, form: Factors) -> Separable:
+def _separable_method(problem: PerformativeProblem, world: World, form: Factors) -> Separable:
     def dense() -> Affine | AffineByProducts:
         if _held(problem):
             return Affine(problem.feasible_set, quadratic(problem, world))
@@ -108,7 +107,7 @@ def respond(problem: PerformativeProblem, deployed: Any, start: Any = None) -> R
     return _respond_in_one_program(*eqx.combine(jax.lax.stop_gradient(arrays), rest))
 
 
-def response_hessian(problem: PerformativeProblem, world: CostToGo) -> Any:
+def response_hessian(problem: PerformativeProblem, world: World) -> Any:
     """𝐇 = ∂_1 g in a given world, (p, p); where it is held."""
     return _shape_of_cost(problem, world).matrix
 
@@ -188,7 +187,7 @@ def best_response(problem: PerformativeProblem, deployed: Any) -> Array:
     require_moments(problem)
     if not known(problem, deployed):
         return differentiable_response(problem, deployed)
-    return jnp.asarray(check_finite("the best response", respond(problem, deployed).M))
+    return check_answer("the best response", respond(problem, deployed).M, problem, deployed)
 
 
 def residual(problem: PerformativeProblem, M: Any, *, deployed: Any = None) -> Array:
@@ -203,4 +202,4 @@ def residual(problem: PerformativeProblem, M: Any, *, deployed: Any = None) -> A
     """
     M, reacting = check_pair(problem, M, deployed)
     require_moments(problem)
-    return jnp.asarray(check_finite("the residual", residual_of(problem, M, reacting)))
+    return check_answer("the residual", residual_of(problem, M, reacting), problem, reacting)

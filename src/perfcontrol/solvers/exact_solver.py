@@ -3,7 +3,7 @@
 import equinox as eqx
 
 from perfcontrol._checks import check_integer, check_tolerance
-from perfcontrol.evaluate.cost_to_go import require_moments
+from perfcontrol.evaluate.loop import require_moments
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.solvers.base import AbstractSolver
 

@@ -4,8 +4,8 @@ import equinox as eqx
 from jaxtyping import Array, Key
 
 from perfcontrol.evaluate.adjoint import mean_path_gradient
-from perfcontrol.evaluate.cost_to_go import require_moments
 from perfcontrol.evaluate.exact import exact_gradient
+from perfcontrol.evaluate.loop import require_moments
 from perfcontrol.problem import PerformativeProblem
 
 

@@ -14,7 +14,7 @@ class Result(eqx.Enumeration):
     )
     nonfinite = (
         "A gradient or iterate was not finite; the last finite iterate is returned. Use a smaller step, or check "
-        "the problem's scales."
+        "the problem's scales; on an infinite horizon, start from a policy that keeps the world mean-square stable."
     )
     not_converged = (
         "The tolerance was not reached. The map may have no fixed point, or the method starts too far from one: try "

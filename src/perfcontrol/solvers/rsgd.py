@@ -9,6 +9,7 @@ from jaxtyping import Array
 
 from perfcontrol._checks import call, check_integer, check_parentheses, fail
 from perfcontrol._programs import Numbers, choose
+from perfcontrol.evaluate.rollout import cut_off
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.solvers.base import AbstractSolver, State, start
 from perfcontrol.solvers.gradients import Pathwise
@@ -40,6 +41,8 @@ class RSGD(AbstractSolver):
         gradient: `pc.Pathwise()`, or `pc.Exact()` for the mean field.
         schedule: `pc.Greedy()`, or `pc.Lazy(k)` to deploy every k-th iterate.
         transform: an optax-like gradient transformation (`init`, `update`), applied before the step size.
+        truncation: T of the paths, for an infinite horizon and only there; gradients are then per stage, with a bias
+            of the order 1/truncation. `pc.Exact()` needs none.
 
     A run whose iterate grows 1e8-fold ends as `Result.diverged`, one that meets a non-finite number as
     `Result.nonfinite`; both keep the last good iterate and the step where it happened.
@@ -54,6 +57,7 @@ class RSGD(AbstractSolver):
     gradient: Any
     schedule: Any
     transform: Any = eqx.field(static=True)
+    truncation: int | None = eqx.field(static=True)
 
     def __init__(
         self,
@@ -63,6 +67,7 @@ class RSGD(AbstractSolver):
         gradient: Any = None,
         schedule: Any = None,
         transform: Any = None,
+        truncation: int | None = None,
     ):
         self.steps = check_integer("steps", steps, 1)
         self.step_size = as_step_size(step_size)
@@ -77,6 +82,7 @@ class RSGD(AbstractSolver):
             check_parentheses(name, part, f"be an object such as `{example}`")
             if not hasattr(part, ability):
                 raise fail(name, type(part).__name__, f"be an object such as `{example}`", "See the reference of RSGD.")
+        self.truncation = None if truncation is None else check_integer("truncation", truncation, 1)
 
     @property
     def max_steps(self) -> int:
@@ -88,6 +94,11 @@ class RSGD(AbstractSolver):
 
     def check(self, problem: PerformativeProblem) -> None:
         self.gradient.check(problem)
+        self._simulated(problem)
+
+    def _simulated(self, problem: PerformativeProblem) -> tuple[PerformativeProblem, float]:
+        """The problem that gradients are of, and their weight."""
+        return cut_off(problem, self.truncation) if self.needs_key or self.truncation is not None else (problem, 1.0)
 
     def init(self, problem: PerformativeProblem, M0: Array) -> State:
         transform_state = None if self.transform is None else call("transform", self.transform.init, M0=M0)
@@ -98,7 +109,8 @@ class RSGD(AbstractSolver):
         own, M = state.own, state.M
         deploys = self.schedule.deploys(own.count)
         deployed = jnp.where(deploys, M, own.deployed)
-        gradient = self.gradient(problem, M, deployed, key, self.batch)
+        simulated, weight = self._simulated(problem)
+        gradient = weight * self.gradient(simulated, M, deployed, key, self.batch)
         transform_state = own.transform_state
         if self.transform is not None:
             gradient, transform_state = call(

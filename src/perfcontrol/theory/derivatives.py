@@ -34,7 +34,7 @@ def obstacles(problem: PerformativeProblem) -> list[str]:
     if not isinstance(problem.cost, QuadraticCost):
         missing.append("the cost is not quadratic: pass cost=pc.QuadraticCost(Q, R)")
     policy = jax.ShapeDtypeStruct(problem.lifted_shape, problem.dtype)
-    if eqx.filter_eval_shape(lambda law, M: law.covariance(M, problem.horizon), problem.perturbation, policy) is None:
+    if eqx.filter_eval_shape(lambda law, M: law.covariance(M, problem.steps), problem.perturbation, policy) is None:
         family = type(problem.perturbation).__name__
         wanted = "perturbation=pc.DirectionalPerturbation(directions, scale)"
         missing.append(f"{family} does not know its mean and covariance: pass a family that does, such as {wanted}")

@@ -47,6 +47,8 @@ def reaction_is_continuous(problem: PerformativeProblem) -> bool:
 
 def existence(problem: PerformativeProblem) -> Existence:
     """True with the argument that gives it, or None with the reason why neither argument applies."""
+    if not problem.is_finite:
+        return Existence(None, "on an infinite horizon only policies that keep the world mean-square stable respond")
     continuous = Assumption("the reaction is continuous in the deployed policy", reaction_status(problem.perturbation))
     radius = set_radius(problem)
     if radius is not None and reaction_is_continuous(problem):

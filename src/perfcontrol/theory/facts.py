@@ -55,7 +55,7 @@ class Facts(NamedTuple):
 
 @read
 def _facts(problem: PerformativeProblem, policy: Array) -> Facts:
-    lifted, T = problem.structure.lift(policy), problem.horizon
+    lifted, T = problem.structure.lift(policy), problem.steps
     noise = problem.noise_under(lifted)
     form = problem.cost.form(T) if isinstance(problem.cost, QuadraticCost) else None
     return Facts(

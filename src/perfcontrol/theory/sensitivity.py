@@ -89,7 +89,7 @@ def feasible_policies(problem: PerformativeProblem, key: Array, count: int) -> A
 
 
 def _draws(problem: PerformativeProblem, M: Array, key: Array) -> Array:
-    return problem.perturbation.sample(key, problem.structure.lift(M), problem.horizon).dense()
+    return problem.perturbation.sample(key, problem.structure.lift(M), problem.steps).dense()
 
 
 @eqx.filter_jit
@@ -104,11 +104,11 @@ def _speeds(problem: PerformativeProblem, M: Array, keys: Array) -> Array:
 
 
 def _coupling(problem: PerformativeProblem, points: Array, keys: Array) -> SensitivityEstimate:
-    best = np.zeros(problem.horizon)
-    error = np.zeros(problem.horizon)
+    best = np.zeros(problem.steps)
+    error = np.zeros(problem.steps)
     for M in points:
         slopes = np.asarray(_speeds(problem, M, keys), dtype=float)
-        for t in range(problem.horizon):
+        for t in range(problem.steps):
             at = slopes[:, t]
             flat = at.reshape(-1, at.shape[-1])
             _, vectors = np.linalg.eigh(flat.T @ flat)
@@ -137,7 +137,7 @@ def _transport(
             "be one that is installed",
             'Install it with pip install "perfcontrol[interop]", or use method="coupling".',
         ) from error
-    T = problem.horizon
+    T = problem.steps
     draw = eqx.filter_jit(lambda M, keys: jax.lax.map(lambda k: _draws(problem, M, k), keys))
     best, error = np.zeros(T), np.zeros(T)
     for index, M in enumerate(points):

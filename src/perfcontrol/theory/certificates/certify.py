@@ -11,6 +11,7 @@ from perfcontrol.theory.certificates.kind import AbstractCertificateKind
 from perfcontrol.theory.certificates.paper import Paper
 from perfcontrol.theory.certificates.rigorous import Rigorous
 from perfcontrol.theory.certificates.sharp import Sharp
+from perfcontrol.theory.existence import existence
 
 SHORTHANDS: dict[str, type[AbstractCertificateKind]] = {
     kind.name: kind for kind in (Paper, Rigorous, GlobalBound, Sharp)
@@ -55,4 +56,6 @@ def certify(
     """
     chosen = as_kind(kind, settings)
     warn_of_unstable_gain(check_problem(problem))
+    if not (chosen.endless or problem.is_finite):
+        return chosen.refuse(["the horizon is infinite: pass problem.truncated(T)"], existence(problem))
     return chosen.assess(problem)

@@ -16,11 +16,13 @@ from perfcontrol.theory.existence import Existence
 class AbstractCertificateKind(abc.ABC):
     """What `pc.certify` takes. A subclass is a frozen dataclass whose fields are its settings.
 
-    name: the shorthand for it. title: how a sentence about its verdict begins.
+    name: the shorthand for it. title: how a sentence about its verdict begins. endless: whether it is for infinite
+    horizons, too.
     """
 
     name: ClassVar[str]
     title: ClassVar[str]
+    endless: ClassVar[bool] = False
 
     @abc.abstractmethod
     def assess(self, problem: PerformativeProblem) -> Certificate:

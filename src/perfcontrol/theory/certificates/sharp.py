@@ -45,6 +45,7 @@ class Sharp(AbstractCertificateKind):
 
     name: ClassVar[str] = "sharp"
     title: ClassVar[str] = "The local test at the stable policy"
+    endless: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         for name, least in (("batch", 1), ("samples", 0), ("pairs", 0)):
@@ -95,7 +96,9 @@ class Sharp(AbstractCertificateKind):
         ]
         if reaction_status(problem.perturbation) != "proved":
             assumptions.append(Assumption("the reaction is differentiable at the stable policy", "declared"))
-        if self.samples and mean_step > 0:
+        if not problem.is_finite:
+            notes.append("Steps are on the gradient per stage. The mean-square test needs paths: problem.truncated(T).")
+        elif self.samples and mean_step > 0:
             notes += self._mean_square(problem, model, mean_step, values)
             assumptions.append(Assumption("the mean-square step, from sampled Jacobians", "estimated"))
         if self.pairs:

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from perfcontrol._checks import check_integer, fail
-from perfcontrol.problem import PerformativeProblem, check_problem
+from perfcontrol.problem import PerformativeProblem, check_end
 from perfcontrol.solvers import InverseStep
 from perfcontrol.solvers.step_sizes import as_step_size
 from perfcontrol.theory.certificates.certify import as_kind
@@ -53,7 +53,7 @@ def rrm_error_bound(
     chosen = as_kind(kind, settings)
     if chosen.name not in ("rigorous", "paper", "global"):
         raise fail("kind", repr(kind), "be 'rigorous', 'paper' or 'global'", "The sharp test is local: no bound.")
-    certificate = chosen.assess(check_problem(problem))
+    certificate = chosen.assess(check_end(problem))
     if not certificate.holds:
         raise fail("problem", str(certificate), f"satisfy the {chosen.name} certificate", "No contraction is proved.")
     assert certificate.rate is not None

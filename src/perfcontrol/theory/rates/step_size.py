@@ -4,7 +4,7 @@ import math
 from typing import Any, NamedTuple
 
 from perfcontrol._checks import fail
-from perfcontrol.problem import PerformativeProblem, check_problem
+from perfcontrol.problem import PerformativeProblem, check_end
 from perfcontrol.theory.certificates.certificate import Certificate
 from perfcontrol.theory.certificates.certify import as_kind
 from perfcontrol.theory.certificates.kind import AbstractCertificateKind
@@ -37,7 +37,7 @@ def descent_constants(
     Raises:
         InputError: the certificate is not applicable, or S ≥ μ̃, so that no step size is proved to work.
     """
-    check_problem(problem)
+    check_end(problem)
     chosen = as_kind(kind, declared)
     if chosen.name not in ("rigorous", "paper"):
         raise fail("kind", repr(kind), "be 'rigorous' or 'paper'", "Only these two come with gradient bounds.")

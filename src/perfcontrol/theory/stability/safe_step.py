@@ -3,7 +3,7 @@
 from typing import Any
 
 from perfcontrol._checks import fail
-from perfcontrol.problem import PerformativeProblem, check_problem
+from perfcontrol.problem import PerformativeProblem, check_end
 from perfcontrol.solvers import Result
 from perfcontrol.theory.derivatives import obstacles
 from perfcontrol.theory.stability.local_model import LocalModel, largest_mean_step, local_model
@@ -51,7 +51,7 @@ def mean_square_stability(
     References:
         docs: theory, "Mean-square stability".
     """
-    missing = obstacles(check_problem(problem))
+    missing = obstacles(check_end(problem))
     if missing:
         raise fail("problem", "; ".join(missing), "allow the exact local analysis", "Choose a step by trial runs.")
     if M is None:

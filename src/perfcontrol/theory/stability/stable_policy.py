@@ -37,7 +37,7 @@ def _starts(problem: PerformativeProblem, count: int) -> Iterator[np.ndarray]:
 
 def proves_absence(problem: PerformativeProblem) -> bool:
     """Whether g(M; M) is affine in M (checked at points) and has no zero on an affine feasible set."""
-    if not problem.feasible_set.affine:
+    if not (problem.feasible_set.affine and problem.is_finite):
         return False
     base, basis = nearest_to_zero(problem), tangent_basis(problem)
 
