@@ -12,11 +12,15 @@ import xarray
 import perfcontrol as pc
 from perfcontrol import results
 from perfcontrol.config import REGIMES, ReproduceSettings
-from perfcontrol.experiments import reproduce as module
 from perfcontrol.experiments.batches import in_single_precision
 from perfcontrol.experiments.reproduce import Outcome, reproduce
+from perfcontrol.experiments.reproduce import divergence as divergence_stage
+from perfcontrol.experiments.reproduce.cases import CASES, UNSTABLE, problems_of, silent, starts_of
+from perfcontrol.experiments.reproduce.exact import exact_stage
+from perfcontrol.experiments.reproduce.laboratory import constant_step, laboratory
+from perfcontrol.experiments.reproduce.stages import Stages
 from perfcontrol.plotting import paper_figures
-from perfcontrol.report import paper_claims
+from perfcontrol.report.paper import judge, regimes
 
 SETTINGS = ReproduceSettings(seeds=3, steps=100, cure_steps=200, sweep_seeds=2, sweep_steps=100)
 STAGES = ("exact", "exact_simplex", "runs", "cure", "sweep")
@@ -52,7 +56,7 @@ def test_runs_equal_single_solves_with_the_same_key(done: tuple[Path, Outcome]) 
     problem = pc.experiments.stock_market("descending", growth=REGIMES["stable"])
     single = in_single_precision(problem)
     key = jax.random.fold_in(jax.random.key(SETTINGS.seed), 2_000_000 + order * SETTINGS.seeds + seed)
-    M0 = module._starts(SETTINGS, problem, SETTINGS.seeds)[seed].astype(np.float32)
+    M0 = starts_of(SETTINGS, problem, SETTINGS.seeds)[seed].astype(np.float32)
     solution = pc.solve(single, pc.RSGD(SETTINGS.steps, SETTINGS.step_size / 60), M0, key=key)
     stable = runs["stable_policy"].sel(regime="stable", order="descending").values
     picked = runs.sel(regime="stable", order="descending", seed=seed)
@@ -63,18 +67,25 @@ def test_runs_equal_single_solves_with_the_same_key(done: tuple[Path, Outcome]) 
 
 
 def test_block_of_stopped_runs_repeats_the_last_policy_and_its_cost() -> None:
-    problems = module._problems(SETTINGS, "rows")
-    lab = module._laboratory(SETTINGS, problems, xarray.Dataset())
-    case, seed = np.full(3, module.UNSTABLE), np.arange(3)
-    runs = lab.runs(5, case, seed, seed, module._constant(10.0))
+    problems = problems_of(SETTINGS, "rows")
+    lab = laboratory(SETTINGS, problems, xarray.Dataset())
+    case, seed = np.full(3, UNSTABLE), np.arange(3)
+    runs = lab.runs(5, case, seed, seed, constant_step(10.0))
     (ended,) = lab.runner.run(runs, 300, lambda share: None)
     assert "success" not in ended.result
     assert ended.steps_taken.max() < 100, "stopped within the first compiled call"
     assert np.all(ended.policies[:, 100:] == ended.policies[:, 99:100])
     cost = lab.runner.costs(runs, ended)
     assert np.all(cost[:, 100:] == cost[:, 99:100])
-    first = float(pc.expected_cost(problems[module.UNSTABLE], runs.start[0]))
+    first = float(pc.expected_cost(problems[UNSTABLE], runs.start[0]))
     assert float(cost[0, 0]) == pytest.approx(first, rel=1e-4)
+
+
+def test_smaller_step_ends_on_the_floor_that_the_theory_gives(done: tuple[Path, Outcome]) -> None:
+    """Quoted: trace of the stationary covariance by the same operator on 512 sampled Jacobians."""
+    cure = results.load_dataset(done[0] / "cure.nc")
+    floors = [float(cure["floor_smaller"].sel(order=order)) for order in ("ascending", "random", "descending")]
+    np.testing.assert_allclose(floors, [0.202, 0.889, 2.223], rtol=0.1)
 
 
 def test_claims_are_complete_and_existence_is_settled(done: tuple[Path, Outcome]) -> None:
@@ -92,7 +103,7 @@ def test_claims_are_complete_and_existence_is_settled(done: tuple[Path, Outcome]
 def test_without_the_simplex_its_claim_and_its_curve_are_left_out(done: tuple[Path, Outcome], tmp_path: Path) -> None:
     data = {name: results.load_dataset(done[0] / f"{name}.nc") for name in STAGES}
     exact, runs, sweep, cure = data["exact"], data["runs"], data["sweep"], data["cure"].drop_vars("simplex")
-    claims = paper_claims.judge(exact, None, runs, cure, sweep, SETTINGS)
+    claims = judge(exact, None, runs, cure, sweep, SETTINGS)
     missing = {claim.claim for claim in done[1].claims} - {claim.claim for claim in claims}
     assert len(missing) == 1
     assert "simplex" in missing.pop()
@@ -101,10 +112,10 @@ def test_without_the_simplex_its_claim_and_its_curve_are_left_out(done: tuple[Pa
 
 @pytest.mark.slow
 def test_quoted_thresholds_are_those_of_the_theory() -> None:
-    problems = module._problems(SETTINGS, "rows")
-    exact = module.exact_stage(problems, SETTINGS, module._silent)
-    quoted = module.mean_square_thresholds(SETTINGS, exact)
-    np.testing.assert_allclose(module.computed_thresholds(SETTINGS, exact), quoted, rtol=0.15)
+    problems = problems_of(SETTINGS, "rows")
+    exact = exact_stage(problems, SETTINGS, silent)
+    quoted = divergence_stage.mean_square_thresholds(SETTINGS, exact)
+    np.testing.assert_allclose(divergence_stage.computed_thresholds(SETTINGS, exact), quoted, rtol=0.15)
     assert np.all(np.diff(quoted[[1, 2, 0]]) > 0)
 
 
@@ -120,7 +131,7 @@ def test_finished_stages_are_read_and_give_the_same_claims(done: tuple[Path, Out
 def test_stage_of_other_settings_or_broken_is_not_reused(done: tuple[Path, Outcome], tmp_path: Path) -> None:
     shutil.copy(done[0] / "sweep.nc", tmp_path)
     (tmp_path / "runs.nc").write_bytes(b"cut short")
-    stages = module._Stages(tmp_path, SETTINGS.model_copy(update={"seed": 1}), fresh=False)
+    stages = Stages(tmp_path, SETTINGS.model_copy(update={"seed": 1}), fresh=False)
     made = xarray.Dataset({"x": ((), 1.0)})
     for name in ("sweep", "runs"):
         assert float(stages.run(name, lambda: made)["x"]) == 1.0
@@ -148,7 +159,7 @@ def _runs(final: float) -> xarray.Dataset:
             "result": (("regime", "order", "seed"), np.full(shape[:3], "success")),
             "stable_cost": (("regime", "order"), np.full((3, 3), 100.0)),
         },
-        coords={**module._CASES, "step": steps},
+        coords={**CASES, "step": steps},
     )
 
 
@@ -156,8 +167,8 @@ def _runs(final: float) -> xarray.Dataset:
 def test_verdicts_follow_the_data(final: float, decays: bool, diverges: bool) -> None:
     runs = _runs(final)
     for regime in ("stable", "general"):
-        assert (paper_claims._decays(runs, regime).verdict != "does not hold") is decays
-        assert (paper_claims._cost_converges(runs, regime, "").verdict != "does not hold") is decays
-    assert (paper_claims._diverge(runs).verdict != "does not hold") is diverges
-    assert paper_claims._cost_larger(runs).verdict == "does not hold"
-    assert paper_claims._order_negligible(runs).verdict == "holds as completed"
+        assert (regimes.error_decays(runs, regime).verdict != "does not hold") is decays
+        assert (regimes.cost_converges(runs, regime, "").verdict != "does not hold") is decays
+    assert (regimes.iterates_diverge(runs).verdict != "does not hold") is diverges
+    assert regimes.cost_is_larger(runs).verdict == "does not hold"
+    assert regimes.order_is_negligible(runs).verdict == "holds as completed"

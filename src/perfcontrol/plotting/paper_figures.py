@@ -11,7 +11,7 @@ from matplotlib.ticker import NullFormatter
 
 from perfcontrol.config import ReproduceSettings
 from perfcontrol.plotting.style import ORDER_COLOURS, ORDER_MARKS, REGIME_TITLES, band, save_figure, styled
-from perfcontrol.report.paper_claims import share_that_left
+from perfcontrol.report.paper.divergence import share_that_left
 
 CEILING = 1e4  # of the error axis, relative to the first error: beyond it a run has left for good
 
@@ -129,10 +129,14 @@ def figure_cure(cure: xarray.Dataset, sweep: xarray.Dataset, settings: Reproduce
         for order, colour in ORDER_COLOURS.items():
             values = cure[name].sel(order=order).values
             middle.plot(n, np.median(values, axis=0), color=colour, linestyle=style)
+            if name == "smaller":
+                floor = float(cure["floor_smaller"].sel(order=order))
+                middle.axhline(floor, color=colour, linestyle=(0, (4, 3)), linewidth=0.8)
         middle.plot([], [], color="#555555", linestyle=style, label=label)
+    middle.plot([], [], color="#555555", linestyle=(0, (4, 3)), linewidth=0.8, label="its mean-square floor")
     _log_axes(middle)
-    middle.set_title("constant step, cured (medians)")
-    middle.set_ylim(bottom=middle.get_ylim()[0] / 6)
+    middle.set_title("constant steps (medians)")
+    middle.set_ylim(bottom=middle.get_ylim()[0] / 12)
     middle.legend(loc="lower left")
     for axes in (left, middle):
         axes.set_xlabel("iteration $n$")
@@ -150,11 +154,11 @@ def figure_cure(cure: xarray.Dataset, sweep: xarray.Dataset, settings: Reproduce
     right.axvline(1, color="#555555", linestyle=(0, (4, 3)), linewidth=1)
     right.annotate(
         "mean-square\nthreshold",
-        (1, 0),
-        xytext=(5, 2),
+        (1, 50),
+        xytext=(-5, 0),
         textcoords="offset points",
-        ha="left",
-        va="bottom",
+        ha="right",
+        va="center",
         color="#555555",
     )
     right.set_xscale("log")

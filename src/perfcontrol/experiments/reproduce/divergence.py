@@ -1,0 +1,107 @@
+"""The unstable regime again: what cures its divergence, what does not, and where it begins."""
+
+from typing import Any
+
+import numpy as np
+import xarray
+
+from perfcontrol.config import ReproduceSettings
+from perfcontrol.experiments.reproduce.cases import UNSTABLE, Progress, problems_of
+from perfcontrol.experiments.reproduce.laboratory import Laboratory, constant_step, diminishing_step
+from perfcontrol.experiments.stock import HORIZON, ORDERS
+from perfcontrol.theory import MeanSquareStability, mean_square_stability
+
+SMALL_STEP = 0.1  # the smaller constant step, relative to the paper's
+FLOOR_SAMPLES = 128  # sampled Jacobians behind the floor of the smaller step: within two per cent
+SWEEP_FACTORS = (0.25, 0.5, 0.7, 0.85, 1.0, 1.2, 1.5, 2.0)
+# Largest constant step (on the stage average) that is stable in mean square, default market, unstable regime: by the
+# operator of `computed_thresholds` on 16,384 sampled Jacobians, within one per cent.
+MEAN_SQUARE_THRESHOLDS = {"ascending": 0.0236, "random": 0.00898, "descending": 0.00461}
+
+
+def cure_stage(
+    lab: Laboratory, bounded: Laboratory | None, settings: ReproduceSettings, progress: Progress
+) -> xarray.Dataset:
+    """The unstable regime again: with a diminishing step, with a smaller one, and on the bounded simplex."""
+    shape = (len(ORDERS), settings.cure_seeds)
+    order, seed = np.indices(shape).reshape(2, -1)
+    step = settings.step_size
+    plans = {
+        "diminishing": (lab, diminishing_step(step), settings.cure_steps),
+        "smaller": (lab, constant_step(SMALL_STEP * step), settings.steps),
+    }
+    if bounded is not None:
+        plans["simplex"] = (bounded, constant_step(step), settings.steps)
+    data: dict[str, Any] = {}
+    total, before = sum(steps for *_, steps in plans.values()), 0
+    for name, (place, rule, steps) in plans.items():
+
+        def show(share: float, before: int = before, steps: int = steps) -> None:
+            progress("what cures divergence", (before + share * steps) / total)
+
+        runs = place.runs(3, UNSTABLE + order, np.arange(order.size), seed, rule)
+        errors = np.empty((order.size, steps + 1))
+        for ended in place.runner.run(runs, steps, show):
+            errors[ended.rows] = place.errors(runs, ended)
+        data[name] = (("order", "seed", f"step_{name}"), errors[:, 1:].reshape(*shape, steps))
+        data[f"step_{name}"] = ((f"step_{name}",), np.arange(1, steps + 1))
+        before += steps
+    data["floor_smaller"] = (("order",), error_floors(settings, lab.exact, SMALL_STEP * step))
+    return xarray.Dataset(data, coords={"order": list(ORDERS), "seed": np.arange(settings.cure_seeds)})
+
+
+def sweep_stage(lab: Laboratory, settings: ReproduceSettings, progress: Progress) -> xarray.Dataset:
+    """Constant steps around the mean-square thresholds of the unstable regime: which runs do not come closer."""
+    factors = np.asarray(SWEEP_FACTORS)
+    grid = (len(ORDERS), len(factors), settings.sweep_seeds)
+    order, factor, seed = np.indices(grid).reshape(3, -1)
+    threshold = mean_square_thresholds(settings, lab.exact)
+    rule = constant_step(threshold[order] * factors[factor])
+    runs = lab.runs(4, UNSTABLE + order, np.arange(order.size), seed, rule)
+    relative, result = np.empty(order.size), np.empty(order.size, dtype="<U9")
+    for ended in lab.runner.run(runs, settings.sweep_steps, lambda share: progress("where divergence begins", share)):
+        error = lab.errors(runs, ended)
+        relative[ended.rows], result[ended.rows] = error[:, -1] / error[:, 0], ended.result
+    return xarray.Dataset(
+        {
+            "relative_error": (("order", "factor", "seed"), relative.reshape(grid)),
+            "threshold": (("order",), threshold),
+            "result": (("order", "factor", "seed"), result.reshape(grid)),
+        },
+        coords={"order": list(ORDERS), "factor": factors, "seed": np.arange(settings.sweep_seeds)},
+    )
+
+
+def mean_square_thresholds(settings: ReproduceSettings, exact: xarray.Dataset) -> np.ndarray:
+    """Largest constant step (on the stage average) that is stable in mean square, unstable regime, by order.
+
+    Quoted where the market is the default one, else computed (some ten seconds).
+    """
+    market = ("feasible_set", "initial_investment", "rate", "trading_hours")
+    default = ReproduceSettings()
+    if all(getattr(settings, name) == getattr(default, name) for name in market):
+        return np.asarray([MEAN_SQUARE_THRESHOLDS[order] for order in ORDERS])
+    return computed_thresholds(settings, exact)
+
+
+def computed_thresholds(settings: ReproduceSettings, exact: xarray.Dataset) -> np.ndarray:
+    """The thresholds by the theory's operator on sampled Jacobians at the stable policies."""
+    return HORIZON * np.asarray([found.threshold_estimate for found in _stability(settings, exact, 1024)])
+
+
+def error_floors(settings: ReproduceSettings, exact: xarray.Dataset, step: float) -> np.ndarray:
+    """Where a constant step on the stage average leaves E ‖M_n - M^PS‖² in the long run, by order; inf for nowhere."""
+    summed = step / HORIZON
+    return np.asarray(
+        [
+            found.error_floor(summed) if summed < found.threshold_estimate else np.inf
+            for found in _stability(settings, exact, FLOOR_SAMPLES)
+        ]
+    )
+
+
+def _stability(settings: ReproduceSettings, exact: xarray.Dataset, samples: int) -> list[MeanSquareStability]:
+    """Mean-square stability at the stable policies of the unstable regime."""
+    problems = problems_of(settings, settings.feasible_set)[UNSTABLE : UNSTABLE + len(ORDERS)]
+    stable = exact["M"].sel(regime="unstable").values[:, None]
+    return [mean_square_stability(p, M, samples=samples) for p, M in zip(problems, stable, strict=True)]

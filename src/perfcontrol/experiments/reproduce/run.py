@@ -1,0 +1,80 @@
+"""The paper's numerical section, run again: every stage kept on disk as it ends, so that a killed run resumes.
+
+Stages: `exact` (stable points without sampling), `runs` (the paper's RSGD), `cure` (what mends the divergence),
+`sweep` (where divergence begins as the step grows). Then figures and the table of claims.
+"""
+
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import xarray
+
+from perfcontrol import results
+from perfcontrol.config import ReproduceSettings
+from perfcontrol.experiments.reproduce.cases import Progress, problems_of, silent
+from perfcontrol.experiments.reproduce.divergence import cure_stage, sweep_stage
+from perfcontrol.experiments.reproduce.exact import exact_stage, repeated_minimisation
+from perfcontrol.experiments.reproduce.laboratory import laboratory, run_stage
+from perfcontrol.experiments.reproduce.stages import Stages
+from perfcontrol.plotting import paper_figures
+from perfcontrol.report.claims import Claim, as_markdown
+from perfcontrol.report.paper import judge
+
+STAGES = ("exact", "exact_simplex", "runs", "cure", "sweep")
+
+
+class Outcome(NamedTuple):
+    """Where the work ended: files written, claims, seconds by stage."""
+
+    files: list[Path]
+    claims: list[Claim]
+    seconds: dict[str, float]
+
+
+def reproduce(out: Path, settings: ReproduceSettings, progress: Progress | None = None, fresh: bool = False) -> Outcome:
+    """Run every stage, draw the figures, judge the claims, write all files under `out`.
+
+    Args:
+        out: folder, made if missing.
+        settings: what to run.
+        progress: called with (stage, share done).
+        fresh: run stages again even where their results are there.
+
+    Returns:
+        Files written, claims, and seconds spent in each stage (0 for stages that were read).
+    """
+    if not jax.config.jax_enable_x64:  # type: ignore[attr-defined]
+        raise RuntimeError('The reproduction needs float64: call jax.config.update("jax_enable_x64", True) first.')
+    results.check_writable(out)
+    progress = progress or silent
+    stages = Stages(out, settings, fresh)
+    problems, bounded_problems = problems_of(settings, settings.feasible_set), problems_of(settings, "simplex")
+
+    def exact_and_repeated() -> xarray.Dataset:
+        return repeated_minimisation(problems, exact_stage(problems, settings, progress), settings)
+
+    with ThreadPoolExecutor() as pool:  # side by side: both spend their time in one-core compilation
+        waiting = [
+            pool.submit(stages.run, "exact_simplex", lambda: exact_stage(bounded_problems, settings, silent))
+            for _ in range(settings.simplex)
+        ]
+        exact = stages.run("exact", exact_and_repeated)
+        exact_bounded = waiting[0].result() if waiting else None
+    lab = laboratory(settings, problems, exact)
+    bounded = None if exact_bounded is None else laboratory(settings, bounded_problems, exact_bounded)
+    runs = stages.run("runs", lambda: run_stage(lab, settings, progress))
+    cure = stages.run("cure", lambda: cure_stage(lab, bounded, settings, progress))
+    sweep = stages.run("sweep", lambda: sweep_stage(lab, settings, progress))
+    began = time.monotonic()
+    claims = judge(exact, exact_bounded, runs, cure, sweep, settings)
+    results.save_json([claim.as_dict() for claim in claims], out / "claims.json")
+    results.save_text(as_markdown(claims, settings.model_dump()), out / "claims.md")
+    stages.seconds["claims"] = time.monotonic() - began
+    began = time.monotonic()
+    files = paper_figures.draw_all(out, exact, runs, cure, sweep, settings)
+    stages.seconds["figures"] = time.monotonic() - began
+    data = [out / f"{stage}.nc" for stage in STAGES if stage in stages.seconds]
+    return Outcome([*data, out / "claims.json", out / "claims.md", *files], claims, stages.seconds)

@@ -1,0 +1,39 @@
+"""Stages kept on disk, so that a killed run resumes."""
+
+import hashlib
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import xarray
+
+from perfcontrol import results
+from perfcontrol.config import ReproduceSettings
+
+
+class Stages:
+    """Stages kept on disk under the fingerprint of what they depend on; a finished one is read, not run again."""
+
+    def __init__(self, folder: Path, settings: ReproduceSettings, fresh: bool):
+        self.folder, self.settings, self.fresh = folder, settings, fresh
+        text = json.dumps([settings.model_dump(), results.versions()], sort_keys=True)
+        self.fingerprint = hashlib.sha256(text.encode()).hexdigest()[:16]
+        self.seconds: dict[str, float] = {}
+
+    def run(self, name: str, compute: Callable[[], xarray.Dataset]) -> xarray.Dataset:
+        path = self.folder / f"{name}.nc"
+        if not self.fresh and path.exists():
+            try:
+                dataset = results.load_dataset(path)
+            except (OSError, ValueError, KeyError):  # not ours, or cut short by an older version: run again
+                dataset = None
+            if dataset is not None and dataset.attrs.get("fingerprint") == self.fingerprint:
+                self.seconds[name] = 0.0
+                return dataset
+        began = time.monotonic()
+        dataset = compute()
+        attributes = {"settings": self.settings.model_dump(), "fingerprint": self.fingerprint}
+        results.save_dataset(dataset, path, attributes)
+        self.seconds[name] = time.monotonic() - began
+        return dataset
