@@ -61,3 +61,40 @@ def strongly_performative(slope: float = 8.0) -> pc.PerformativeProblem:
     calm, turbulent = (pc.best_response(_switched(0, nowhere, side, 50.0, 0.05, 2.0), nowhere) for side in (1.0, -1.0))
     direction = (calm - turbulent) / jnp.sum((calm - turbulent) ** 2)  # 1 apart in the statistic
     return _switched(0, direction, jnp.sum(direction * (calm + turbulent)) / 2, slope, 0.05, 2.0)
+
+
+def swapped(rho: float, back: float | None = None) -> pc.PerformativeProblem:
+    """Static: z = rho P M + signs with P the swap of two coordinates, cost ½‖z - M‖²; M is the policy's column 0.
+
+    The average of N iterates has covariance (I - rho P)⁻² / N around the stable policy 0 (maths: section 12). With `back`
+    the second coordinate reacts to the first by that factor instead.
+    """
+    first = np.outer([1.0, 0.0], [1.0, 0.0])
+    weight = np.zeros((2, 2, 1, 2, 2))
+    weight[0, 0, 0, 1, 0], weight[1, 0, 0, 0, 0] = rho, rho if back is None else back
+    return pc.PerformativeProblem(
+        system=pc.LinearSystem(np.zeros((2, 2)), -np.eye(2)),
+        horizon=2,
+        noise=pc.Constant([1.0, 0.0]),
+        cost=pc.QuadraticCost(np.array([0.0, 0.0, 0.5])[:, None, None] * np.eye(2), np.zeros((2, 2))),
+        perturbation=pc.DirectionalPerturbation(
+            np.stack([first, first[::-1]]), np.ones(2), mean=pc.Affine(-first, weight)
+        ),
+        feasible_set=pc.Support(np.array([[True, False], [True, False]])),
+    )
+
+
+def steered() -> pc.PerformativeProblem:
+    """Two states, one input, two parameters; scale and mean of the perturbation react."""
+    return pc.PerformativeProblem(
+        system=pc.LinearSystem([[0.6, 0.3], [0.0, 0.5]], [[0.0], [1.0]]),
+        horizon=4,
+        noise=pc.Rademacher([1.0, 0.5]),
+        cost=pc.QuadraticCost(np.eye(2), [[0.2]]),
+        gain=[[0.1, 0.2]],
+        perturbation=pc.DirectionalPerturbation(
+            [[[0.0, 0.0], [0.3, 0.2]]],
+            pc.Affine([0.5], [[[[0.5, 0.3]]]]),
+            mean=pc.Affine(np.zeros((2, 2)), 0.3 * normal(0, 2, 2, 1, 1, 2)),
+        ),
+    )

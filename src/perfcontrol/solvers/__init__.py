@@ -1,6 +1,8 @@
 """Which policy: the solver loop and the methods, one a file."""
 
+from perfcontrol.solvers.averaging import Average
 from perfcontrol.solvers.base import AbstractSolver, Solution, SolveError
+from perfcontrol.solvers.confidence import ConfidenceRegion, confidence_region
 from perfcontrol.solvers.continuation import Continuation
 from perfcontrol.solvers.gradients import Exact, Pathwise
 from perfcontrol.solvers.result import Result
@@ -9,21 +11,25 @@ from perfcontrol.solvers.rsgd import RSGD
 from perfcontrol.solvers.schedules import Greedy, Lazy
 from perfcontrol.solvers.solve import solve
 from perfcontrol.solvers.stable_point import StablePoint
-from perfcontrol.solvers.step_sizes import InverseStep
+from perfcontrol.solvers.step_sizes import InverseStep, PowerStep
 
 __all__ = [
     "RRM",
     "RSGD",
     "AbstractSolver",
+    "Average",
+    "ConfidenceRegion",
     "Continuation",
     "Exact",
     "Greedy",
     "InverseStep",
     "Lazy",
     "Pathwise",
+    "PowerStep",
     "Result",
     "Solution",
     "SolveError",
     "StablePoint",
+    "confidence_region",
     "solve",
 ]

@@ -3,7 +3,6 @@
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
@@ -11,8 +10,9 @@ from perfcontrol._checks import call, check_integer, check_parentheses, fail
 from perfcontrol._programs import Numbers, choose
 from perfcontrol.evaluate.rollout import cut_off
 from perfcontrol.problem import PerformativeProblem
+from perfcontrol.solvers.averaging import Average, Tally, as_average
 from perfcontrol.solvers.base import AbstractSolver, State, start
-from perfcontrol.solvers.gradients import Pathwise
+from perfcontrol.solvers.gradients import Exact, Pathwise
 from perfcontrol.solvers.result import Result
 from perfcontrol.solvers.schedules import Greedy
 from perfcontrol.solvers.step_sizes import as_step_size, size_of
@@ -26,6 +26,7 @@ class _Own(eqx.Module):
     deployed: Numbers
     threshold: Numbers
     transform_state: Any
+    tally: Tally | None  # with averaging: the iterate too, the state's own M being the average
 
 
 class RSGD(AbstractSolver):
@@ -36,19 +37,22 @@ class RSGD(AbstractSolver):
 
     Args:
         steps: N ≥ 1.
-        step_size: a number, `pc.InverseStep(phi1, phi2)`, or a function n -> η_n.
+        step_size: a number, `pc.InverseStep(phi1, phi2)`, `pc.PowerStep(eta, alpha)`, or a function n -> η_n.
         batch: paths per step.
         gradient: `pc.Pathwise()`, or `pc.Exact()` for the mean field.
         schedule: `pc.Greedy()`, or `pc.Lazy(k)` to deploy every k-th iterate.
         transform: an optax-like gradient transformation (`init`, `update`), applied before the step size.
         truncation: T of the paths, for an infinite horizon and only there; gradients are then per stage, with a bias
             of the order 1/truncation. `pc.Exact()` needs none.
+        average: True, or a `pc.Average`: `.M`, and with it the history, is the average of the iterates since a
+            burn-in (before it, the iterate), and `stats["covariance"]` (p, p) estimates its covariance; best with
+            `pc.PowerStep`. `pc.confidence_region` makes a region of it.
 
     A run whose iterate grows 1e8-fold ends as `Result.diverged`, one that meets a non-finite number as
     `Result.nonfinite`; both keep the last good iterate and the step where it happened.
 
     References:
-        Algorithm 1; Theorem 1 for the step.
+        Algorithm 1; Theorem 1 for the step; for averages docs: theory, "Averaged iterates".
     """
 
     steps: int = eqx.field(static=True)
@@ -58,6 +62,7 @@ class RSGD(AbstractSolver):
     schedule: Any
     transform: Any = eqx.field(static=True)
     truncation: int | None = eqx.field(static=True)
+    average: Average | None
 
     def __init__(
         self,
@@ -68,6 +73,7 @@ class RSGD(AbstractSolver):
         schedule: Any = None,
         transform: Any = None,
         truncation: int | None = None,
+        average: bool | Average = False,
     ):
         self.steps = check_integer("steps", steps, 1)
         self.step_size = as_step_size(step_size)
@@ -83,6 +89,14 @@ class RSGD(AbstractSolver):
             if not hasattr(part, ability):
                 raise fail(name, type(part).__name__, f"be an object such as `{example}`", "See the reference of RSGD.")
         self.truncation = None if truncation is None else check_integer("truncation", truncation, 1)
+        self.average = as_average(average)
+        if self.average is not None and transform is not None:
+            raise fail(
+                "transform",
+                "a gradient transformation together with average",
+                "be left out where iterates are averaged",
+                "The covariance of the average is that of plain steps.",
+            )
 
     @property
     def max_steps(self) -> int:
@@ -90,11 +104,13 @@ class RSGD(AbstractSolver):
 
     @property
     def needs_key(self) -> bool:
-        return isinstance(self.gradient, Pathwise)
+        return not isinstance(self.gradient, Exact)
 
     def check(self, problem: PerformativeProblem) -> None:
         self.gradient.check(problem)
-        self._simulated(problem)
+        simulated, _ = self._simulated(problem)
+        if self.average is not None:
+            self.average.check(simulated, self.steps)
 
     def _simulated(self, problem: PerformativeProblem) -> tuple[PerformativeProblem, float]:
         """The problem that gradients are of, and their weight."""
@@ -103,10 +119,12 @@ class RSGD(AbstractSolver):
     def init(self, problem: PerformativeProblem, M0: Array) -> State:
         transform_state = None if self.transform is None else call("transform", self.transform.init, M0=M0)
         threshold = DIVERGENCE * (1 + jnp.sqrt(jnp.sum(M0**2)))
-        return start(M0, _Own(jnp.zeros((), int), jnp.zeros((), int), M0, threshold, transform_state))
+        tally = None if self.average is None else self.average.init(self._simulated(problem)[0], M0)
+        return start(M0, _Own(jnp.zeros((), int), jnp.zeros((), int), M0, threshold, transform_state, tally))
 
     def step(self, problem: PerformativeProblem, state: State, key: Array | None) -> State:
-        own, M = state.own, state.M
+        own = state.own
+        M = state.M if own.tally is None else own.tally.iterate
         deploys = self.schedule.deploys(own.count)
         deployed = jnp.where(deploys, M, own.deployed)
         simulated, weight = self._simulated(problem)
@@ -116,20 +134,32 @@ class RSGD(AbstractSolver):
             gradient, transform_state = call(
                 "transform", self.transform.update, gradient=gradient, state=transform_state, policy=M
             )
-        following = problem.feasible_set.project(M - size_of(self.step_size, own.count).astype(M.dtype) * gradient)
+        ahead = M - size_of(self.step_size, own.count).astype(M.dtype) * gradient
+        following = problem.feasible_set.project(ahead)
         finite = jnp.all(jnp.isfinite(following))
         diverged = jnp.sqrt(jnp.sum(following**2)) > own.threshold
         good = finite & ~diverged
         result = Result.where(finite, Result.where(diverged, Result.diverged, Result.running), Result.nonfinite)
-        kept = jax.tree.map(lambda new, old: jnp.where(good, new, old), transform_state, own.transform_state)
+        kept, tally = choose(good, transform_state, own.transform_state), own.tally
+        answer = jnp.where(good, following, M)
+        if self.average is not None and own.tally is not None:
+            moved = jnp.sqrt(jnp.sum((following - ahead) ** 2))
+            grown = self.average.add(simulated, own.tally, own.count, self.steps, following, gradient, moved)
+            tally = choose(good, grown, own.tally)
+            answer = tally.mean
         return State(
-            jnp.where(good, following, M),
+            answer,
             state.steps + 1,
             result,
-            _Own(own.count + 1, own.deployments + deploys, deployed, own.threshold, kept),
+            _Own(own.count + 1, own.deployments + deploys, deployed, own.threshold, kept, tally),
         )
 
     def finish(self, problem: PerformativeProblem, state: State, stopped: bool) -> tuple[Result, dict[str, Any]]:
         # A fixed number of steps is what was asked for: reaching it, or the max_steps of `solve`, is success.
         result = choose(state.result == Result.running, Result.success, state.result)
-        return result, {"deployments": state.own.deployments}
+        stats = {"deployments": state.own.deployments}
+        if self.average is not None:
+            simulated, weight = self._simulated(problem)
+            tally = state.own.tally
+            stats |= self.average.statistics(simulated, weight, tally, self.steps, self.step_size, self.needs_key)
+        return result, stats

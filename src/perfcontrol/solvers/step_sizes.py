@@ -35,6 +35,43 @@ class InverseStep(eqx.Module):
         return self.phi1 / (n + self.phi2)
 
 
+class PowerStep(eqx.Module):
+    """η_n = eta (n + 1)^{-alpha}: slower than 1/n, so that the average of the iterates is asymptotically efficient.
+
+    Examples:
+        >>> round(float(PowerStep(0.5, 0.75)(15)), 4)
+        0.0625
+
+    Args:
+        eta: the first step, a positive number.
+        alpha: the exponent, 1/2 < alpha < 1.
+
+    Raises:
+        InputError: numbers outside these ranges.
+
+    References:
+        Not in the paper; docs: theory, "Averaged iterates".
+    """
+
+    eta: Array
+    alpha: Array
+
+    def __init__(self, eta: Any, alpha: Any = 0.6):
+        self.eta, self.alpha = as_array("eta", eta), as_array("alpha", alpha)
+        if is_concrete(self.eta) and not (self.eta.ndim == 0 and float(self.eta) > 0):
+            raise fail("eta", str(self.eta), "be a positive number", "It is the first step.")
+        if is_concrete(self.alpha) and not (self.alpha.ndim == 0 and 0.5 < float(self.alpha) < 1):
+            raise fail(
+                "alpha",
+                str(self.alpha),
+                "be a number between 1/2 and 1, both excluded",
+                "Pass 0.6, or pc.InverseStep(phi1, phi2) for steps that fall like 1/n.",
+            )
+
+    def __call__(self, n: Array) -> Array:
+        return self.eta * (jnp.asarray(n, self.eta.dtype) + 1) ** -self.alpha
+
+
 class ConstantStep(eqx.Module):
     """η_n = size."""
 
@@ -65,8 +102,8 @@ def size_of(rule: Any, n: Array) -> Array:
 
 
 def as_step_size(value: Any) -> Any:
-    """A number, an `InverseStep`, or a function n -> η_n."""
-    if isinstance(value, InverseStep | ConstantStep | _FunctionStep):
+    """A number, an `InverseStep`, a `PowerStep`, or a function n -> η_n."""
+    if isinstance(value, InverseStep | PowerStep | ConstantStep | _FunctionStep):
         return value
     check_parentheses("step_size", value, "be a number, a function of n, or `pc.InverseStep(phi1, phi2)`")
     if callable(value):
