@@ -66,8 +66,8 @@ def strongly_performative(slope: float = 8.0) -> pc.PerformativeProblem:
 def swapped(rho: float, back: float | None = None) -> pc.PerformativeProblem:
     """Static: z = rho P M + signs with P the swap of two coordinates, cost ½‖z - M‖²; M is the policy's column 0.
 
-    The average of N iterates has covariance (I - rho P)⁻² / N around the stable policy 0 (maths: section 12). With `back`
-    the second coordinate reacts to the first by that factor instead.
+    The average of N iterates has covariance (I - rho P)⁻² / N around the stable policy 0 (maths: section 12). With
+    `back` the second coordinate reacts to the first by that factor instead.
     """
     first = np.outer([1.0, 0.0], [1.0, 0.0])
     weight = np.zeros((2, 2, 1, 2, 2))

@@ -120,6 +120,20 @@ def test_problem_without_moments_gets_batch_means():
     assert_refused(lambda: pc.solve(convex, refused, key=KEY), "covariance", "batch means")
 
 
+def test_average_over_an_infinite_horizon_is_that_of_the_truncated_problem_per_stage():
+    endless = pc.PerformativeProblem(
+        system=pc.LinearSystem([[0.5]], [[1.0]]),
+        horizon=float("inf"),
+        noise=pc.Rademacher([1.0]),
+        cost=pc.QuadraticCost([[1.0]], [[0.5]]),
+        perturbation=pc.DirectionalPerturbation([[[0.2]]], pc.Affine([0.5], [[[[0.5]]]])),
+    )
+    cut = pc.solve(endless, pc.RSGD(40, 0.1, average=True, truncation=9), key=KEY)
+    whole = pc.solve(endless.truncated(9), pc.RSGD(40, 0.01, average=True), key=KEY)
+    assert_close(cut.M, whole.M, 1e-11)
+    assert_close(cut.stats["covariance"], whole.stats["covariance"], 1e-10)
+
+
 # --- the region ------------------------------------------------------------------------------------------------------
 
 
