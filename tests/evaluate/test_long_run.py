@@ -11,39 +11,30 @@ import pytest
 import perfcontrol as pc
 from perfcontrol.evaluate import lyapunov
 from perfcontrol.evaluate.stationary import mean_square_radius
+from tests.evaluate.endless import (
+    CROSS,
+    DEPLOYED,
+    U_TARGET,
+    W_COVARIANCE,
+    W_MEAN,
+    X_TARGET,
+    A,
+    B,
+    D,
+    H,
+    K,
+    M,
+    Q,
+    R,
+    everything,
+    m,
+    n,
+    offset,
+    scales,
+)
 from tests.oracles.lqr import generalised_riccati_gain, infinite_horizon_cost
 from tests.oracles.stationary import stationary_cost
 from tests.tools import assert_close, assert_refused, central_differences, normal, random_psd, tolerance
-
-n, m, H = 3, 2, 3
-A, B, K = 0.25 * normal(1, n, n), 0.7 * normal(2, n, m), 0.1 * normal(3, m, n)
-D = 0.15 * normal(4, 2, n, n + m)
-Q, R, CROSS = random_psd(5, n), random_psd(6, m), 0.05 * normal(7, n, m)
-X_TARGET, U_TARGET = normal(8, n), normal(9, m)
-W_MEAN, W_COVARIANCE = 0.4 * normal(10, n), random_psd(11, n)
-OFFSET = 0.03 * normal(12, n, n + m)
-M, DEPLOYED = 0.2 * normal(13, H, m, n), 0.2 * normal(14, H, m, n)
-
-
-def scales(M):
-    return jnp.stack([0.3 + 0.2 * jnp.sum(M**2), 0.2 + 0.1 * jnp.sum(M)])
-
-
-def offset(M):
-    return OFFSET * (1 + jnp.sum(M))
-
-
-def everything(horizon=math.inf, mean=W_MEAN, **others) -> pc.PerformativeProblem:
-    """Targets, a cross weight, a noise mean, a gain, and a reacting Δ of reacting mean on [x; u]."""
-    parts = {
-        "system": pc.LinearSystem(A, B),
-        "noise": pc.Gaussian(mean, W_COVARIANCE),
-        "cost": pc.QuadraticCost(Q, R, cross=CROSS, state_target=X_TARGET, input_target=U_TARGET),
-        "memory": H,
-        "gain": K,
-        "perturbation": pc.DirectionalPerturbation(D, pc.Function(scales), mean=pc.Function(offset)),
-    }
-    return pc.PerformativeProblem(horizon=horizon, **{**parts, **others})
 
 
 def oracle(M, deployed, mean=W_MEAN):
