@@ -22,6 +22,8 @@ def cache(path: str | os.PathLike[str]) -> None:
     Raises:
         InputError: the folder cannot be made or written to.
     """
+    if not isinstance(path, str | os.PathLike):
+        raise fail("path", type(path).__name__, "be the path of a folder", 'Pass for example pc.cache("~/.cache/jax").')
     folder = Path(path).expanduser()
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -4,14 +4,12 @@ import inspect
 import math
 import re
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.core
 import jax.dtypes
-import jax.errors
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -77,9 +75,9 @@ def as_array(name: str, value: Any, remedy: str = "") -> Array:
                 return jnp.asarray(value, dtype=float)
             raise fail(
                 name,
-                f"{type(value).__name__} ({error})",
+                "None" if value is None else f"{type(value).__name__} ({error})",
                 "be an array of real numbers",
-                "Pass a rectangular nested list, a NumPy array or a JAX array.",
+                "Pass a number, a rectangular nested list, a NumPy array or a JAX array.",
             ) from error
         if host.dtype == np.float64 and not jax.config.jax_enable_x64 and not _warned_about_precision:  # type: ignore[attr-defined]
             _warned_about_precision = True
@@ -117,6 +115,8 @@ def check_shape(name: str, array: Any, expected: Sequence[int], labels: Sequence
     expected = tuple(expected)
     if tuple(array.shape) == expected:
         return
+    if not expected:
+        raise fail(name, f"shape {tuple(array.shape)}", "be one number", remedy or "Pass a single number.")
     axes = ", ".join(labels) + ("," if len(labels) == 1 else "")
     hint = remedy or "Check the axis order: (sample, time, lag, input, state)."
     if len(expected) >= 2 and array.shape == (*expected[:-2], expected[-1], expected[-2]):
@@ -210,20 +210,31 @@ def check_key(key: Any) -> Any:
         raise fail("key", "None", "be a JAX random key", "Pass key=jax.random.key(0): randomness is explicit here.")
     if isinstance(key, int | np.integer):
         raise fail("key", repr(key), "be a JAX random key", f"Pass key=jax.random.key({key}).")
-    if not isinstance(key, jax.Array):
-        raise fail("key", type(key).__name__, "be a JAX random key", "Pass key=jax.random.key(0).")
+    raw = isinstance(key, jax.Array) and key.dtype == jnp.uint32 and key.ndim > 0
+    if not raw and not (isinstance(key, jax.Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key)):
+        got = f"an array of {key.dtype}" if isinstance(key, jax.Array) else type(key).__name__
+        raise fail("key", got, "be a JAX random key", "Pass key=jax.random.key(0).")
     # raw keys of jax.random.PRNGKey draw the same numbers as their typed form
-    return jax.random.wrap_key_data(key) if key.dtype == jnp.uint32 else key
+    key = jax.random.wrap_key_data(key) if raw else key
+    if key.shape:
+        raise fail("key", f"keys of shape {key.shape}", "be one JAX random key", "Pass one of them, or use jax.vmap.")
+    return key
+
+
+def check_positive_tolerance(tolerance: Any) -> float | None:
+    """A relative tolerance, or None for the default of the precision that will be used."""
+    if tolerance is not None and not (isinstance(tolerance, int | float | np.floating) and 0 < tolerance < np.inf):
+        raise fail("tolerance", repr(tolerance), "be a positive number", "Pass None for the default.")
+    return tolerance
 
 
 def check_tolerance(tolerance: float | None, dtype: Any) -> float:
     """The relative tolerance, 1e-11 in float64 and 1e-5 in float32 when None; raise if `dtype` cannot reach it."""
+    check_positive_tolerance(tolerance)
     epsilon = float(jnp.finfo(dtype).eps)
     double = epsilon < 1e-12
     if tolerance is None:
         return 1e-11 if double else 1e-5
-    if not (isinstance(tolerance, int | float | np.floating) and 0 < tolerance < np.inf):
-        raise fail("tolerance", repr(tolerance), "be a positive number", "Pass None for the default.")
     floor = 20 * epsilon
     if tolerance < floor:
         remedy = (
@@ -238,49 +249,3 @@ def check_tolerance(tolerance: float | None, dtype: Any) -> float:
             remedy,
         )
     return float(tolerance)
-
-
-class _StaticCallable(eqx.Module):
-    """A plain function as a pytree without leaves."""
-
-    function: Callable = eqx.field(static=True)
-
-    def __call__(self, *arguments: Any) -> Any:
-        return self.function(*arguments)
-
-
-def as_callable(name: str, value: Any) -> Any:
-    """A callable as a pytree: modules and `jax.tree_util.Partial` with their leaves, plain functions without any."""
-    if not callable(value):
-        raise fail(name, type(value).__name__, "be callable", "Pass a function; swept numbers go in an eqx.Module.")
-    if isinstance(value, eqx.Module | jax.tree_util.Partial):
-        return value
-    return _StaticCallable(value)
-
-
-def call(name: str, function: Callable, /, **arguments: Any) -> Any:
-    """function(*arguments) of a user's own function: what it raises says which one it was, and what it was given."""
-    try:
-        return function(*arguments.values())
-    except Exception as error:
-        given = ", ".join(_shaped(argument, value) for argument, value in arguments.items())
-        if isinstance(error, InputError) and not isinstance(error, TypeError):  # it names an argument already
-            error.add_note(f"Raised inside `{name}`, which was given {given}.")
-            raise
-        traced = isinstance(error, jax.errors.ConcretizationTypeError | jax.errors.TracerArrayConversionError)
-        receiver = "A sampler" if "key" in arguments else "A policy map"
-        lifted = f"{receiver} receives the lifted policy (memory, input, state). " if "M" in arguments else ""
-        remedy = "Write it in jax.numpy, with jnp.where instead of if: numbers are not known while it is compiled."
-        raise fail(
-            name,
-            " ".join(f"{type(error).__name__} from it: {error}".split("\n")[0].split()).rstrip(".: "),
-            f"accept {given}",
-            lifted + (remedy if traced else "Its own error stands above this one."),
-        ) from error
-
-
-def _shaped(name: str, value: Any) -> str:
-    dtype, shape = getattr(value, "dtype", None), getattr(value, "shape", ())
-    if dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key):
-        return f"a {name}"
-    return f"{name} of shape {tuple(shape)}" if shape else name

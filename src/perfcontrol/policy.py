@@ -8,6 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from perfcontrol._checks import fail
 from perfcontrol._linalg import matvec
 
 
@@ -17,10 +18,20 @@ class DisturbanceAction(eqx.Module):
     Args:
         gain: K, (m, n), or (T+1, m, n).
         M: the full policy (H, m, n).
+
+    Raises:
+        InputError: shapes that do not fit.
     """
 
     gain: Array
     M: Float[Array, "H m n"]
+
+    def __check_init__(self) -> None:
+        if self.M.ndim != 3:
+            raise fail("M", f"{self.M.shape}", "be a full policy of shape (H, m, n)", "Add the lag axis: M[None].")
+        if self.gain.shape[-2:] != self.M.shape[1:] or self.gain.ndim not in (2, 3):
+            required = f"have shape (m, n) = {self.M.shape[1:]}, or (T+1, m, n)"
+            raise fail("gain", f"{self.gain.shape}", required, "It fits M, (H, m, n).")
 
     def init(self) -> Float[Array, "H n"]:
         """The empty memory: row i-1 holds w_{t-i}."""

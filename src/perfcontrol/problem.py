@@ -12,7 +12,6 @@ from jaxtyping import Array
 
 from perfcontrol._checks import (
     as_array,
-    call,
     check_instance,
     check_integer,
     check_shape,
@@ -21,6 +20,7 @@ from perfcontrol._checks import (
     is_concrete,
     varies,
 )
+from perfcontrol._functions import call
 from perfcontrol._linalg import Matrix, along_time
 from perfcontrol.costs import AbstractCost
 from perfcontrol.perturbations import AbstractPerturbation, NoPerturbation, fitted_perturbation
@@ -126,8 +126,9 @@ class PerformativeProblem(eqx.Module):
         self.noise = as_policy_map("noise", noise) if reacting_noise else fitted_vector("noise", noise, n, self.horizon)
         if isinstance(initial_state, Sequence):
             raise fail("initial_state", "a Sequence", "be one random vector", "Pass an array (n,) or another law.")
-        start = initial_state if isinstance(initial_state, AbstractRandomVector | type) else Constant(initial_state)
-        self.initial_state = fitted_vector("initial_state", start, n, self.horizon)
+        if not isinstance(initial_state, AbstractRandomVector | type):
+            initial_state = Constant(initial_state)
+        self.initial_state = fitted_vector("initial_state", initial_state, n, self.horizon)
         if self.initial_state.mean.ndim == 2:
             raise fail("initial_state", "a law that varies in time", "be one random vector", "Pass one vector (n,).")
         self.has_gain = not (isinstance(gain, int | float) and gain == 0)

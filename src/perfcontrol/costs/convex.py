@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from perfcontrol._checks import as_array, as_callable, call, fail, is_concrete
+from perfcontrol._checks import as_array, fail, is_concrete
+from perfcontrol._functions import as_callable, call
 from perfcontrol.costs.base import AbstractCost, as_discount, check_discount, stage_factors
 from perfcontrol.costs.convexity import check_convexity
 

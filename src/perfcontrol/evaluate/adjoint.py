@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
-from perfcontrol._checks import check_integer, check_key
+from perfcontrol._checks import as_array, check_integer, check_key, check_shape, fail
 from perfcontrol._linalg import rmatvec
 from perfcontrol._programs import program
 from perfcontrol.evaluate.rollout import (
@@ -26,7 +26,7 @@ from perfcontrol.evaluate.rollout import (
     sample_path,
 )
 from perfcontrol.policy import feedforward_adjoint
-from perfcontrol.problem import PerformativeProblem
+from perfcontrol.problem import PerformativeProblem, check_problem
 
 
 def path_gradient(problem: PerformativeProblem, path: Path | Trajectories) -> Array:
@@ -43,6 +43,9 @@ def path_gradient(problem: PerformativeProblem, path: Path | Trajectories) -> Ar
     References:
         Appendix B, equation (grad M ct), with the window w_{t-1}, ..., w_{t-H}.
     """
+    check_problem(problem)
+    if not isinstance(path, Path | Trajectories):
+        raise fail("path", type(path).__name__, "be simulated paths", "Pass what pc.simulate returns.")
     if not problem.is_finite:
         return path_gradient(problem.truncated(path.w.shape[-2]), path)
     if isinstance(path, Trajectories):
@@ -90,7 +93,18 @@ def recover_noise(
 
     Returns:
         The noise, (T, n).
+
+    Raises:
+        InputError: shapes that do not fit.
     """
+    n, m = check_problem(problem).state_size, problem.input_size
+    x, u, A = as_array("x", x), as_array("u", u), as_array("A", A)
+    if x.ndim != 2 or len(x) < 2:
+        raise fail("x", f"{x.shape}", f"have shape (T+1, n) with n = {n}", "Pass one path, its first state included.")
+    T = len(x) - 1
+    check_shape("x", x, (T + 1, n), ("T+1", "n"))
+    check_shape("u", u, (T + 1, m), ("T+1", "m"))
+    check_shape("A", A, (T, n, n), ("T", "n", "n"))
     return x[1:] - jnp.einsum("tij,tj->ti", A, x[:-1]) - input_term(problem.system.B, u)
 
 

@@ -86,7 +86,7 @@ class DensePerturbation(AbstractPerturbation):
                 raise fail("law", f"{type(law).__name__} of {law.mean.shape[0]} steps", required, "Use `mean` instead.")
         elif isinstance(law, type):
             check_instance("law", law, AbstractRandomVector, "pc.Gaussian(mean, covariance)")
-        elif law in WHITE_LAWS:
+        elif isinstance(law, str) and law in WHITE_LAWS:
             self.law, self.kind = None, law
         else:
             raise fail("law", repr(law), f"be a random vector or one of {WHITE_LAWS}", "Pass one of these.")

@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Key
 
-from perfcontrol._checks import as_array, as_callable, call, check_nonnegative, fail
+from perfcontrol._checks import as_array, check_nonnegative, fail
+from perfcontrol._functions import as_callable, call
 from perfcontrol.perturbations.base import AbstractPerturbation, CovarianceOperator, DenseDraws, Draws
 
 

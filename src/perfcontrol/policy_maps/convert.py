@@ -5,7 +5,8 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from perfcontrol._checks import as_array, call
+from perfcontrol._checks import as_array
+from perfcontrol._functions import call
 from perfcontrol.policy_maps.base import AbstractPolicyMap
 from perfcontrol.policy_maps.constant import ConstantMap
 from perfcontrol.policy_maps.function import Function

@@ -36,7 +36,7 @@ class TruncatedGaussian(AbstractRandomVector):
 
     def __init__(self, mean: Any, covariance: Any, bound: Any):
         self.centre, spread = mean_and_covariance(mean, covariance)
-        self.radius = as_array("bound", bound)
+        self.radius = as_array("bound", bound, "Without truncation it is pc.Gaussian(mean, covariance).")
         check_shape("bound", self.radius, (), (), "Pass one number, in standard deviations.")
         if not is_concrete(self.radius) or not is_concrete(spread):
             raise fail("bound", "a traced value", "be known when the law is built", "Build the law outside jit.")

@@ -2,7 +2,7 @@
 
 import equinox as eqx
 
-from perfcontrol._checks import check_integer, check_tolerance
+from perfcontrol._checks import check_integer, check_positive_tolerance, check_tolerance
 from perfcontrol.evaluate.loop import require_moments
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.solvers.base import AbstractSolver
@@ -18,7 +18,7 @@ class AbstractExactSolver(AbstractSolver):
     limit: int = eqx.field(static=True)
 
     def __init__(self, tolerance: float | None, max_steps: int):
-        self.tolerance = tolerance
+        self.tolerance = check_positive_tolerance(tolerance)
         self.limit = check_integer("max_steps", max_steps, 1)
 
     @property

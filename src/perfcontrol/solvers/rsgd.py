@@ -6,7 +6,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from perfcontrol._checks import call, check_integer, check_parentheses, fail
+from perfcontrol._checks import check_integer, check_parentheses, fail
+from perfcontrol._functions import call
 from perfcontrol._programs import Numbers, choose
 from perfcontrol.evaluate.rollout import cut_off
 from perfcontrol.problem import PerformativeProblem
@@ -84,7 +85,10 @@ class RSGD(AbstractSolver):
         for name, part, ability, example in (
             ("gradient", self.gradient, "check", "pc.Pathwise()"),
             ("schedule", self.schedule, "deploys", "pc.Greedy()"),
+            ("transform", self.transform, "update", "optax.scale_by_adam()"),
         ):
+            if part is None:
+                continue
             check_parentheses(name, part, f"be an object such as `{example}`")
             if not hasattr(part, ability):
                 raise fail(name, type(part).__name__, f"be an object such as `{example}`", "See the reference of RSGD.")

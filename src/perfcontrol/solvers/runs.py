@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from perfcontrol._checks import call
+from perfcontrol._functions import call
 from perfcontrol._programs import numerics, on_host, program
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.solvers.base import AbstractSolver, State

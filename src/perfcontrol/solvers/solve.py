@@ -53,6 +53,9 @@ def solve(
     check_instance("solver", solver, AbstractSolver, "pc.StablePoint()").check(problem)
     key = check_key(key) if solver.needs_key or key is not None else None
     every = check_integer("every", every, 1)
+    for name, function in (("record", record), ("progress", progress)):
+        if function is not None and not callable(function):
+            raise fail(name, type(function).__name__, "be callable", "Pass a function, or leave it out.")
     total = solver.max_steps if max_steps is None else check_integer("max_steps", max_steps, 0)
     M0 = problem.initial_policy() if M0 is None else problem.check_policy("M0", M0)
     leaves = jax.tree.leaves(eqx.filter((problem, solver, M0, key), eqx.is_array))

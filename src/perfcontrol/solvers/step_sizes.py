@@ -7,7 +7,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from perfcontrol._checks import as_array, call, check_parentheses, fail, is_concrete
+from perfcontrol._checks import as_array, check_parentheses, fail, is_concrete
+from perfcontrol._functions import call
 
 
 class InverseStep(eqx.Module):
