@@ -6,7 +6,8 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from perfcontrol.cli.app import app, in_words
+from perfcontrol._checks import fail
+from perfcontrol.cli.app import Commands, app, in_words
 
 runner = CliRunner()
 
@@ -62,3 +63,25 @@ def test_errors_of_the_operating_system_are_said_in_words(error, words, capsys):
     assert said.startswith("error: cannot write the table")
     for word in words:
         assert word in said
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "words"),
+    [
+        (OSError(28, "No space left on device"), 1, "error: cannot go on: the disk is full."),  # as of a full stdout
+        (fail("growth", "nan", "be finite", "Pass a number."), 2, "error: `growth` must be finite; got nan."),
+    ],
+)
+def test_no_command_ends_in_a_traceback_of_what_system_or_library_refuse(error, status, words):
+    commands = typer.Typer(cls=Commands)
+
+    @commands.callback()
+    def root() -> None: ...
+
+    @commands.command()
+    def work() -> None:
+        raise error
+
+    result = runner.invoke(commands, ["work"])
+    assert result.exit_code == status
+    assert result.stderr.startswith(words)

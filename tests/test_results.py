@@ -33,3 +33,32 @@ def test_save_json_refuses_non_finite_numbers_and_writes_nothing(tmp_path: Path)
     with pytest.raises(ValueError, match="JSON"):
         results.save_json({"value": float("nan")}, tmp_path / "claims.json")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_full_disk_is_reported_with_the_file_that_was_meant(tmp_path: Path) -> None:
+    target = tmp_path / "table.txt"
+    with pytest.raises(OSError) as caught, results.written_whole(target):
+        raise OSError(28, "No space left on device")  # as `write` raises it: without a name
+    assert caught.value.filename == str(target)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_folder_in_the_place_of_the_file_is_reported_without_the_temporary_name(tmp_path: Path) -> None:
+    (tmp_path / "runs.nc").mkdir()
+    with pytest.raises(IsADirectoryError) as caught:
+        results.save_dataset(xarray.Dataset(), tmp_path / "runs.nc", {})
+    assert (caught.value.filename, caught.value.filename2) == (str(tmp_path / "runs.nc"), None)
+    assert [path.name for path in tmp_path.iterdir()] == ["runs.nc"]
+
+
+def test_check_writable_leaves_nothing_behind_and_names_the_folder(tmp_path: Path, monkeypatch) -> None:
+    results.check_writable(tmp_path / "new")
+    assert list((tmp_path / "new").iterdir()) == []
+
+    def refuse(**_):
+        raise PermissionError(13, "Permission denied", "some temporary name")
+
+    monkeypatch.setattr(results.tempfile, "TemporaryFile", refuse)
+    with pytest.raises(PermissionError) as caught:
+        results.check_writable(tmp_path / "new")
+    assert caught.value.filename == str(tmp_path / "new")

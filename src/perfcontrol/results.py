@@ -1,6 +1,7 @@
 """Results on disk: labelled arrays in NetCDF, tables in JSON and Markdown, each file written whole or not at all."""
 
 import importlib.metadata
+import io
 import json
 import os
 import platform
@@ -15,25 +16,39 @@ import xarray
 
 @contextmanager
 def written_whole(path: Path) -> Iterator[Path]:
-    """A temporary path beside `path` that takes its place when the block ends well, and vanishes otherwise."""
+    """A temporary path beside `path` that takes its place when the block ends well, and vanishes otherwise.
+
+    An OSError names `path`, or the file in its way, and never the temporary one.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}.", suffix=path.suffix)
-    os.close(handle)
-    temporary = Path(name)
+    with _naming(path):
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}.", suffix=path.suffix)
+        os.close(handle)
+        temporary = Path(name)
+        try:
+            yield temporary
+            # mkstemp makes files private; results are for everyone whom the folder is for
+            temporary.chmod(0o644)
+            os.replace(temporary, path)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Errors of the operating system inside are about `path`; a full disk says of itself not even which file."""
     try:
-        yield temporary
-        # mkstemp makes files private; results are for everyone whom the folder is for
-        temporary.chmod(0o644)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+        yield
+    except OSError as error:
+        error.filename, error.filename2 = str(path), None
+        raise
 
 
 def check_writable(folder: Path) -> None:
-    """Make the folder and write a file in it, so that OSError comes before the work and not after it."""
-    with written_whole(folder / ".probe"):
-        pass
-    (folder / ".probe").unlink()
+    """Make the folder and write in it, so that OSError comes before the work and not after it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with _naming(folder), tempfile.TemporaryFile(dir=folder) as probe:
+        probe.write(b"probe")
 
 
 def versions() -> dict[str, str]:
@@ -49,8 +64,10 @@ def save_dataset(dataset: xarray.Dataset, path: Path, attributes: Mapping[str, A
     }
     dataset = dataset.assign_attrs({**plain, "versions": json.dumps(versions())})
     encoding = {str(name): {"zlib": True, "complevel": 1} for name, values in dataset.data_vars.items() if values.ndim}
+    whole = io.BytesIO()  # HDF5 itself reports a full disk late, and not as an OSError
+    dataset.to_netcdf(whole, engine="h5netcdf", encoding=encoding)
     with written_whole(path) as temporary:
-        dataset.to_netcdf(temporary, engine="h5netcdf", encoding=encoding)
+        temporary.write_bytes(whole.getbuffer())
 
 
 def load_dataset(path: Path) -> xarray.Dataset:

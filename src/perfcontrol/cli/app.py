@@ -1,6 +1,7 @@
 """The `perfcontrol` command: what its subcommands share. JAX is imported inside them, so that help comes at once."""
 
 import contextlib
+import errno
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -8,10 +9,30 @@ from typing import Any
 
 import typer
 from rich.console import Console
+from typer.core import TyperGroup
 
-app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 console = Console()
 errors = Console(stderr=True)
+
+
+class Commands(TyperGroup):
+    """The commands, none of which ends in a traceback because of what the system or the library refuses."""
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            with in_words("go on"):
+                return super().invoke(ctx)
+        except ValueError as error:
+            from perfcontrol._checks import InputError
+
+            if isinstance(error, InputError):
+                raise refuse(str(error)) from None
+            raise
+
+
+app = typer.Typer(
+    cls=Commands, no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None
+)
 
 
 class _Cache:
@@ -31,7 +52,7 @@ def root(
 
 def refuse(message: str, status: int = 2) -> typer.Exit:
     """Say what is wrong and give the exit to raise."""
-    errors.print(f"error: {message}", style="red", markup=False, highlight=False)
+    errors.print(f"error: {message}", style="red", markup=False, highlight=False, soft_wrap=True)
     return typer.Exit(status)
 
 
@@ -40,9 +61,11 @@ def in_words(doing: str) -> Iterator[None]:
     """Errors of the operating system in words: what was tried, which file, what to do."""
     try:
         yield
+    except BrokenPipeError:  # the reader has gone, as with `| head`: no error
+        raise
     except OSError as error:
         where = error.filename2 or error.filename
-        at = f" at {where}" if where else ""
+        at = f" at {where}" if where and not doing.endswith(str(where)) else ""
         raise refuse(f"cannot {doing}{at}: {_why(error)}", 1) from None
 
 
@@ -53,10 +76,11 @@ def _why(error: OSError) -> str:
         FileExistsError: "a file stands where a folder should be. Choose another path, or move that file.",
         NotADirectoryError: "a file stands where a folder should be. Choose another path, or move that file.",
         IsADirectoryError: "a folder stands where a file should be. Choose another path.",
-        28: "the disk is full. Free some space, or choose another disk; what was finished is kept.",
-        30: "the disk is read-only. Choose another path.",
-        36: "the name is too long. Choose a shorter one.",
-        122: "the disk quota is used up. Free some space; what was finished is kept.",
+        errno.ENOSPC: "the disk is full. Free some space, or choose another disk; what was finished is kept.",
+        errno.EFBIG: "the file would be larger than is allowed. Raise the limit (ulimit -f), or choose another disk.",
+        errno.EROFS: "the disk is read-only. Choose another path.",
+        errno.ENAMETOOLONG: "the name is too long. Choose a shorter one.",
+        errno.EDQUOT: "the disk quota is used up. Free some space; what was finished is kept.",
     }
     known = remedies.get(error.errno or 0) or remedies.get(type(error))
     return known or f"{error.strerror or error}. Check the path and the disk."
