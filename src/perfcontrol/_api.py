@@ -51,7 +51,7 @@ from perfcontrol.random_vectors import (
     TruncatedGaussian,
     Uniform,
 )
-from perfcontrol.response import best_response, residual
+from perfcontrol.response import SampleAverage, best_response, estimate_response, residual
 from perfcontrol.sets import (
     AbstractSet,
     AbstractStructure,
@@ -160,6 +160,7 @@ __all__ = [
     "Rigorous",
     "RowSimplex",
     "RowSum",
+    "SampleAverage",
     "SampledPerturbation",
     "Sequence",
     "Sharp",
@@ -181,6 +182,7 @@ __all__ = [
     "confidence_region",
     "design_gain",
     "estimate_cost",
+    "estimate_response",
     "estimate_sensitivity",
     "expected_cost",
     "expected_cost_by_moments",

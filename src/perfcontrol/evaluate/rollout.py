@@ -75,13 +75,17 @@ def input_adjoint(B: Matrix, y: Float[Array, "T n"]) -> Float[Array, "T m"]:
     return y @ B if B.ndim == 2 else jnp.einsum("tnm,tn->tm", B, y)
 
 
+def draw_path(problem: PerformativeProblem, deployed: Array, key: Key[Array, ""]) -> tuple[Array, Array, Draws]:
+    """Initial state (n,), noise (T, n) and perturbations of one path; `deployed` is lifted."""
+    initial_key, noise_key, perturbation_key = jax.random.split(key, 3)
+    x0 = problem.initial_state.sample(initial_key, 1)[0].astype(deployed.dtype)
+    w = problem.noise_under(deployed).sample(noise_key, problem.horizon).astype(deployed.dtype)
+    return x0, w, problem.perturbation.sample(perturbation_key, deployed, problem.horizon)
+
+
 def sample_path(problem: PerformativeProblem, policy: Array, deployed: Array, key: Key[Array, ""]) -> Path:
     """One path; `policy` and `deployed` are lifted."""
-    initial_key, noise_key, perturbation_key = jax.random.split(key, 3)
-    x0 = problem.initial_state.sample(initial_key, 1)[0].astype(policy.dtype)
-    w = problem.noise_under(deployed).sample(noise_key, problem.horizon).astype(policy.dtype)
-    draws = problem.perturbation.sample(perturbation_key, deployed, problem.horizon)
-    return run_path(problem, policy, x0, w, draws)
+    return run_path(problem, policy, *draw_path(problem, deployed, key))
 
 
 def run_path(problem: PerformativeProblem, policy: Array, x0: Array, w: Array, draws: Draws) -> Path:

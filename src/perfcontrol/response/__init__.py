@@ -1,5 +1,6 @@
 """The best response to a deployed policy, exactly: the quadratic that it minimises, one file a method."""
 
+from perfcontrol.response.estimate import SampleAverage, estimate_response
 from perfcontrol.response.respond import (
     Response,
     best_response,
@@ -13,7 +14,9 @@ from perfcontrol.response.respond import (
 
 __all__ = [
     "Response",
+    "SampleAverage",
     "best_response",
+    "estimate_response",
     "residual",
     "residual_of",
     "respond",

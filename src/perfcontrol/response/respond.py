@@ -24,8 +24,10 @@ from perfcontrol.evaluate.rollout import check_pair
 from perfcontrol.problem import PerformativeProblem, check_problem
 from perfcontrol.response import quadratic as quadratics
 from perfcontrol.response.affine import Affine, AffineByProducts
+from perfcontrol.response.estimate import SampleAverage, estimate_response, is_exact
 from perfcontrol.response.projected import Projected, nearest
 from perfcontrol.response.quadratic import Factors, Operator, factors, quadratic, quadratic_by_passes, stationary
+from perfcontrol.response.sampled import Sampled, minimise, sampled_jacobian, sampled_residual
 from perfcontrol.response.separable import Separable
 from perfcontrol.sets import FullStructure, Unconstrained
 
@@ -99,6 +101,8 @@ _respond_in_one_program = program(_respond)
 def respond(problem: PerformativeProblem, deployed: Any, start: Any = None) -> Response:
     """Φ(deployed) in the free parameters; pure, works under jit and vmap; carries no derivative."""
     start = deployed if start is None else start
+    if isinstance(problem, Sampled):
+        return Response(*minimise(problem, on_host(deployed), on_host(start)))
     if known(problem, deployed, start) and _held(problem):
         with np.errstate(all="ignore"):
             return _respond(problem, on_host(deployed), on_host(start))
@@ -114,6 +118,8 @@ def response_hessian(problem: PerformativeProblem, world: World) -> Any:
 
 def response_jacobian(problem: PerformativeProblem, deployed: Any, response: Any) -> Any:
     """Φ'(deployed), (p, p), given Φ(deployed), by the implicit function theorem; where the Hessian is held."""
+    if isinstance(problem, Sampled):
+        return sampled_jacobian(problem, on_host(deployed), on_host(response))
     world = world_of(problem, deployed)
     method = _method(problem, world, _shape_of_cost(problem, world))
     assert not isinstance(method, AffineByProducts)
@@ -122,6 +128,9 @@ def response_jacobian(problem: PerformativeProblem, deployed: Any, response: Any
 
 def response_pushforward(problem: PerformativeProblem, deployed: Array, response: Array) -> Operator:
     """V -> Φ'(deployed)[V], given Φ(deployed), by products alone; for use inside programs."""
+    if isinstance(problem, Sampled):
+        slope = sampled_jacobian(problem, deployed, response)
+        return lambda V: (slope @ V.reshape(-1)).reshape(V.shape)
     world = world_of(problem, deployed)
     newton = _method(problem, world, _shape_of_cost(problem, world)).newton(response)
     base, pushforward = jax.linearize(lambda policy: exact_gradient(problem, response, policy), deployed)
@@ -161,29 +170,43 @@ _residual_in_one_program = program(natural_residual)
 
 def residual_of(problem: PerformativeProblem, M: Any, deployed: Any) -> Any:
     """`natural_residual`; from the host where that can be, else as one program."""
+    if isinstance(problem, Sampled):
+        return sampled_residual(problem, on_host(M), on_host(deployed))
     if known(problem, M, deployed) and _held(problem):
         with np.errstate(all="ignore"):
             return natural_residual(problem, on_host(M), on_host(deployed))
     return _residual_in_one_program(problem, M, deployed)
 
 
-def best_response(problem: PerformativeProblem, deployed: Any) -> Array:
+def best_response(
+    problem: PerformativeProblem,
+    deployed: Any,
+    *,
+    key: Any = None,
+    tolerance: float | None = None,
+    sampling: SampleAverage | None = None,
+) -> Array:
     """Φ(deployed) = argmin over the feasible set of C_T(·; deployed): what retraining on observed data would give.
 
-    Exact for quadratic costs. Without constraint or mean noise it does not depend on the noise covariance, nor on
+    Exact for quadratic costs and known moments; else sampled (`estimate_response`), which needs a key. Without constraint or mean noise it does not depend on the noise covariance, nor on
     x_0. The least-norm minimiser where there are several and the set is affine.
 
     Args:
-        problem: with a QuadraticCost and a perturbation of known moments.
+        problem: the problem.
         deployed: free policy parameters that the world reacts to.
+        key: JAX random key, where the response must be sampled; not used where it is exact.
+        tolerance: relative standard error of a sampled response; None for 0.01.
+        sampling: how many paths it may use; None for `SampleAverage()`.
 
     Returns:
         Shape `problem.policy_shape`.
 
     Raises:
-        InputError: wrong shapes, or a cost or perturbation without closed moments.
+        InputError: wrong shapes; without a key, a cost or perturbation without closed moments.
     """
     deployed = check_problem(problem).check_policy("deployed", deployed)
+    if key is not None and not is_exact(problem):
+        return estimate_response(problem, deployed, key=key, tolerance=tolerance, sampling=sampling).mean
     require_moments(problem)
     if not known(problem, deployed):
         return differentiable_response(problem, deployed)

@@ -1,0 +1,215 @@
+"""Best responses by sample-average approximation: expectations become means over paths of a fixed key.
+
+With common random numbers a world is a deterministic function of the deployed policy, and for fixed draws states and
+inputs are affine in the policy, so that the mean cost over the paths is convex in it:
+    Φ_N(M') = argmin over the feasible set of (1/N) Σ_s J_s(M; M').
+Newton steps on quadratic models of it share their minimisation with the exact engine. By the delta method
+    Φ_N - Φ ≈ D (ḡ - E g), Cov Φ_N ≈ D Cov(g_s) Dᵀ / N,
+where D is the derivative of the minimiser by the gradient, -𝐇⁻¹ without constraints.
+"""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Key
+
+from perfcontrol._linalg import frobenius, solve
+from perfcontrol._programs import Numbers, choose, known, numerics, program, while_loop
+from perfcontrol.evaluate.adjoint import path_gradient
+from perfcontrol.evaluate.rollout import draw_path, run_path
+from perfcontrol.problem import PerformativeProblem
+from perfcontrol.response.affine import Affine
+from perfcontrol.response.projected import Projected, nearest
+from perfcontrol.response.quadratic import Quadratic
+
+LANES = 32  # paths worked on together
+NEWTON_STEPS = 60
+ARMIJO = 1e-4  # share of the predicted decrease that a step must bring
+QUANTILE = 1.6448536269514722  # of the normal law at 95 %
+
+
+class Sampled(PerformativeProblem):
+    """A problem whose expectations are means over the first `samples` paths of a key."""
+
+    key: Key[Array, ""]
+    samples: Numbers
+
+    def __init__(self, problem: PerformativeProblem, key: Key[Array, ""], samples: Any):
+        for field in dataclasses.fields(PerformativeProblem):
+            setattr(self, field.name, getattr(problem, field.name))
+        self.key, self.samples = key, samples
+
+
+class Averages(eqx.Module):
+    """Means over the paths at a policy: cost, gradient (policy_shape), Hessian (p, p); covariance (p, p) of the
+    gradients of single paths."""
+
+    cost: Numbers
+    gradient: Numbers
+    hessian: Numbers
+    covariance: Numbers
+
+
+def _mean(world: Sampled, one: Any, like: Any) -> Any:
+    """The mean of `one(key of a path)` over the paths, `LANES` at a time; any number of them without recompilation."""
+
+    def block(index: Array, total: Any) -> Any:
+        numbers = index * LANES + jnp.arange(LANES)
+        values = jax.vmap(lambda number: one(jax.random.fold_in(world.key, number)))(numbers)
+        counts = numbers < world.samples
+
+        def add(total: Array, value: Array) -> Array:
+            return total + jnp.sum(jnp.where(counts.reshape(-1, *[1] * (value.ndim - 1)), value, 0), axis=0)
+
+        return jax.tree.map(add, total, values)
+
+    blocks = -(-jnp.asarray(world.samples) // LANES)
+    total = jax.lax.fori_loop(0, blocks, block, jax.tree.map(jnp.zeros_like, like))
+    return jax.tree.map(lambda leaf: leaf / jnp.asarray(world.samples, leaf.dtype), total)
+
+
+@program
+def averages(world: Sampled, M: Any, deployed: Any) -> Averages:
+    """What Newton's method and the standard error need to know at M while the world reacts to `deployed`."""
+    reacting = world.structure.lift(deployed)
+
+    def one(key: Array) -> tuple[Array, Array, Array, Array]:
+        drawn = draw_path(world, reacting, key)
+
+        def gradient(M: Array) -> tuple[Array, Array]:
+            path = run_path(world, world.structure.lift(M), *drawn)
+            return path_gradient(world, path).reshape(-1), jnp.sum(world.cost.path_cost(path.x, path.u))
+
+        slope, push, cost = jax.linearize(gradient, M, has_aux=True)
+        directions = jnp.eye(M.size, dtype=M.dtype).reshape(-1, *M.shape)
+        return cost, slope, jax.vmap(push)(directions), jnp.outer(slope, slope)
+
+    square = jnp.zeros((M.size, M.size), M.dtype)
+    cost, slope, hessian, second = _mean(world, one, (square[0, 0], square[0], square, square))
+    return Averages(cost, slope.reshape(M.shape), (hessian + hessian.T) / 2, second - jnp.outer(slope, slope))
+
+
+@program
+def reaction(world: Sampled, M: Any, deployed: Any) -> Array:
+    """∂_2 of the mean gradient at M, (p, p): how the paths, and with them the gradient, move with `deployed`."""
+    policy = world.structure.lift(M)
+
+    def one(key: Array) -> Array:
+        def gradient(deployed: Array) -> Array:
+            drawn = draw_path(world, world.structure.lift(deployed), key)
+            return path_gradient(world, run_path(world, policy, *drawn)).reshape(-1)
+
+        return jax.jacfwd(gradient)(deployed).reshape(M.size, M.size)
+
+    return _mean(world, one, jnp.zeros((M.size, M.size), M.dtype))
+
+
+def _model(world: Sampled, at: Averages, M: Any, damping: Any = 0) -> Affine | Projected:
+    """The quadratic model of the mean cost about M, its curvature raised by `damping`, and the way to minimise it."""
+    xp, _ = numerics(at, M)
+    matrix = at.hessian + xp.asarray(damping, M.dtype) * xp.eye(M.size, dtype=M.dtype)
+    linear = at.gradient - (matrix @ M.reshape(-1)).reshape(M.shape)
+    step = 1 / xp.maximum(xp.linalg.eigvalsh(matrix)[-1], xp.finfo(M.dtype).tiny)
+    return (Affine if world.feasible_set.affine else Projected)(world.feasible_set, Quadratic(linear, step, matrix))
+
+
+def _finite(at: Averages) -> Any:
+    xp, _ = numerics(at)
+    return xp.isfinite(at.cost) & xp.all(xp.isfinite(at.gradient)) & xp.all(xp.isfinite(at.hessian))
+
+
+def minimise(world: Sampled, deployed: Any, start: Any) -> tuple[Any, Any]:
+    """Φ_N(deployed), NaN where the paths overflow, and whether it is the only minimiser; carries no derivative."""
+    xp, _ = numerics(world, deployed, start)
+    precision = xp.finfo(start.dtype).eps
+    M = nearest(world.feasible_set, start)
+    at = averages(world, M, deployed)
+    sound = _finite(at)
+    if known(sound) and not sound:
+        return xp.full_like(start, xp.nan), xp.asarray(False)
+
+    def curvature(at: Averages) -> Any:
+        return xp.trace(at.hessian) / start.size + xp.finfo(start.dtype).tiny
+
+    def improve(carry: Any) -> Any:
+        M, at, damping, _, count = carry
+        model = _model(world, at, M, damping)
+        ahead, _ = model.minimise(M)
+        there = averages(world, ahead, deployed)
+        promised = xp.sum(at.gradient * (ahead - M))
+        # Where the decrease is below the rounding of the cost, the model is trusted.
+        allowed = at.cost + ARMIJO * promised + 100 * precision * xp.abs(at.cost)
+        good = (there.cost <= allowed) & _finite(there)
+        scale = frobenius(ahead) + model.form.step * frobenius(model.form.linear)
+        moved = xp.where(good, frobenius(ahead - M) / xp.where(scale > 0, scale, 1), xp.inf)
+        lighter = xp.maximum(damping / 10, 1e-10 * curvature(at))
+        heavier = xp.maximum(10 * damping, 1e-3 * curvature(at))
+        kept = choose(good, (ahead, there), (M, at))
+        return *kept, xp.where(good, lighter, heavier), moved.astype(M.dtype), count + 1
+
+    def unfinished(carry: Any) -> Any:
+        *_, moved, count = carry
+        return (moved > xp.sqrt(precision)) & (count < NEWTON_STEPS)
+
+    first = (M, at, 1e-10 * curvature(at), xp.asarray(xp.inf, start.dtype), xp.asarray(0))
+    M, at, *_ = while_loop(unfinished, improve, first)
+    unique = _model(world, at, M).minimise(M)[1]
+    return xp.where(sound, M, xp.nan), unique
+
+
+def sampled_jacobian(world: Sampled, deployed: Any, response: Any) -> Any:
+    """Φ_N'(deployed), (p, p), given Φ_N(deployed), by the implicit function theorem."""
+    model = _model(world, averages(world, response, deployed), response)
+    return model.jacobian(response, reaction(world, response, deployed))
+
+
+def sampled_residual(world: Sampled, M: Any, deployed: Any) -> Any:
+    """The relative natural residual of the mean cost, with its Hessian at M; infinite where the paths overflow."""
+    xp, _ = numerics(world, M, deployed)
+    at = averages(world, M, deployed)
+    if known(at.cost) and not _finite(at):
+        return xp.asarray(xp.inf, M.dtype)
+    form = _model(world, at, M).form
+    moved = frobenius(M - nearest(world.feasible_set, M - form.step * at.gradient))
+    scale = frobenius(M) + form.step * frobenius(form.linear)
+    return xp.where(_finite(at), moved / xp.where(scale > 0, scale, 1), xp.inf)
+
+
+class Uncertainty(NamedTuple):
+    """Of a sampled policy: standard errors, policy_shape, and the radius of its ball of 95 % confidence."""
+
+    standard_error: Any
+    radius: Any
+
+    @property
+    def total(self) -> Any:
+        """The root mean square of the policy's error in the Frobenius norm."""
+        return frobenius(self.standard_error)
+
+
+def uncertainty(world: Sampled, M: Any, deployed: Any = None) -> Uncertainty:
+    """That of a best response to `deployed`; without it that of a stable policy, which its own reaction amplifies.
+
+    A fixed point moves by (I - Φ')⁻¹ times what the best response moves. The radius takes ‖error‖² for a multiple of
+    a χ² of the same mean and variance (Satterthwaite), with the quantile of Wilson and Hilferty.
+    """
+    xp, _ = numerics(world, M, deployed)
+    reacting = M if deployed is None else deployed
+    at = averages(world, M, reacting)
+    model = _model(world, at, M)
+    values, vectors = xp.linalg.eigh(at.covariance)
+    root = vectors * xp.sqrt(xp.maximum(values, 0) / xp.asarray(world.samples, M.dtype))
+    factor = model.jacobian(M, root)
+    if deployed is None:
+        slope = model.jacobian(M, reaction(world, M, reacting))
+        factor = solve(xp.eye(M.size, dtype=M.dtype) - slope, factor)
+    covariance = factor @ factor.T
+    trace, square = xp.trace(covariance), xp.sum(covariance**2)
+    trace_or_one = xp.where(trace > 0, trace, 1)
+    freedom = xp.where(square > 0, trace_or_one**2 / xp.where(square > 0, square, 1), 1)
+    ninth = 2 / (9 * freedom)
+    radius = xp.sqrt(trace * (1 - ninth + QUANTILE * xp.sqrt(ninth)) ** 3)
+    return Uncertainty(xp.sqrt(xp.diagonal(covariance)).reshape(M.shape), radius)
