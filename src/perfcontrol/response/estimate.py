@@ -38,7 +38,7 @@ class SampleAverage(eqx.Module):
     samples: int = eqx.field(static=True)
     limit: int = eqx.field(static=True)
 
-    def __init__(self, samples: int = 1024, limit: int = 2**17):
+    def __init__(self, samples: int = 1024, limit: int = 2**18):
         self.samples = check_integer("samples", samples, 2)
         self.limit = check_integer("limit", limit, self.samples)
 

@@ -188,8 +188,9 @@ def best_response(
 ) -> Array:
     """Φ(deployed) = argmin over the feasible set of C_T(·; deployed): what retraining on observed data would give.
 
-    Exact for quadratic costs and known moments; else sampled (`estimate_response`), which needs a key. Without constraint or mean noise it does not depend on the noise covariance, nor on
-    x_0. The least-norm minimiser where there are several and the set is affine.
+    Exact for quadratic costs and known moments; else sampled, which needs a key (see `estimate_response`). Without
+    constraint or mean noise it does not depend on the noise covariance, nor on x_0. The least-norm minimiser where
+    there are several, the set is affine, and the response exact.
 
     Args:
         problem: the problem.

@@ -134,28 +134,32 @@ def minimise(world: Sampled, deployed: Any, start: Any) -> tuple[Any, Any]:
     def curvature(at: Averages) -> Any:
         return xp.trace(at.hessian) / start.size + xp.finfo(start.dtype).tiny
 
-    def improve(carry: Any) -> Any:
-        M, at, damping, _, count = carry
+    def lookout(M: Any, at: Averages, damping: Any) -> tuple[Any, Any]:
+        """Where the model leads, and how far that is relative to the policies that it knows."""
         model = _model(world, at, M, damping)
         ahead, _ = model.minimise(M)
+        scale = frobenius(ahead) + model.form.step * frobenius(model.form.linear)
+        return ahead, frobenius(ahead - M) / xp.where(scale > 0, scale, 1)
+
+    def improve(carry: Any) -> Any:
+        M, at, damping, ahead, _, count = carry
         there = averages(world, ahead, deployed)
         promised = xp.sum(at.gradient * (ahead - M))
         # Where the decrease is below the rounding of the cost, the model is trusted.
         allowed = at.cost + ARMIJO * promised + 100 * precision * xp.abs(at.cost)
         good = (there.cost <= allowed) & _finite(there)
-        scale = frobenius(ahead) + model.form.step * frobenius(model.form.linear)
-        moved = xp.where(good, frobenius(ahead - M) / xp.where(scale > 0, scale, 1), xp.inf)
         lighter = xp.maximum(damping / 10, 1e-10 * curvature(at))
         heavier = xp.maximum(10 * damping, 1e-3 * curvature(at))
-        kept = choose(good, (ahead, there), (M, at))
-        return *kept, xp.where(good, lighter, heavier), moved.astype(M.dtype), count + 1
+        damping = xp.where(good, lighter, heavier).astype(M.dtype)
+        M, at = choose(good, (ahead, there), (M, at))
+        return M, at, damping, *lookout(M, at, damping), count + 1
 
     def unfinished(carry: Any) -> Any:
-        *_, moved, count = carry
-        return (moved > xp.sqrt(precision)) & (count < NEWTON_STEPS)
+        *_, distance, count = carry
+        return (distance > xp.sqrt(precision)) & (count < NEWTON_STEPS)
 
-    first = (M, at, 1e-10 * curvature(at), xp.asarray(xp.inf, start.dtype), xp.asarray(0))
-    M, at, *_ = while_loop(unfinished, improve, first)
+    damping = xp.asarray(1e-10 * curvature(at), M.dtype)
+    M, at, *_ = while_loop(unfinished, improve, (M, at, damping, *lookout(M, at, damping), xp.asarray(0)))
     unique = _model(world, at, M).minimise(M)[1]
     return xp.where(sound, M, xp.nan), unique
 

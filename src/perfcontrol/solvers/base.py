@@ -54,6 +54,10 @@ class AbstractSolver(eqx.Module):
         """The method that `solve` tries from the same start where this one fails; None: the failure is reported."""
         return None
 
+    def on(self, problem: PerformativeProblem, key: Any) -> "AbstractSolver":
+        """What `solve` runs for such a problem: this method itself, unless it has another form for it."""
+        return self
+
     @abc.abstractmethod
     def check(self, problem: PerformativeProblem) -> None:
         """Raise InputError where this method does not apply to the problem."""

@@ -10,11 +10,12 @@ from typing import Any
 
 import equinox as eqx
 
-from perfcontrol._checks import check_tolerance, fail
+from perfcontrol._checks import fail
 from perfcontrol._linalg import frobenius, solve
 from perfcontrol._programs import Numbers, choose, cond, numerics, while_loop
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.response import residual_of, respond, response_jacobian
+from perfcontrol.response.estimate import SampleAverage
 from perfcontrol.response.projected import nearest, projection_slope
 from perfcontrol.response.quadratic import DENSE_LIMIT
 from perfcontrol.sets import Unconstrained
@@ -46,8 +47,10 @@ class Continuation(AbstractExactSolver):
     `residual` (relative natural residual), `unique` (of the best response), `level` (λ reached).
 
     Args:
-        tolerance: None for 1e-11 in float64, 1e-5 in float32.
+        tolerance: None for 1e-11 in float64, 1e-5 in float32; where responses are sampled, the relative standard
+            error of the answer, None for 1e-2.
         max_steps: at most so many steps along the curve.
+        sampling: how many paths sampled responses may use; None for `SampleAverage()`.
 
     Raises:
         InputError: more free parameters than can be held as a matrix; cost or perturbation without closed moments.
@@ -56,8 +59,8 @@ class Continuation(AbstractExactSolver):
         Not in the paper; docs: theory, "Existence".
     """
 
-    def __init__(self, tolerance: float | None = None, max_steps: int = 500):
-        super().__init__(tolerance, max_steps)
+    def __init__(self, tolerance: float | None = None, max_steps: int = 500, sampling: SampleAverage | None = None):
+        super().__init__(tolerance, max_steps, sampling)
 
     def check(self, problem: PerformativeProblem) -> None:
         super().check(problem)
@@ -75,7 +78,7 @@ class Continuation(AbstractExactSolver):
     def step(self, problem: PerformativeProblem, state: State, key: Any) -> State:
         own, first = state.own, state.steps == 0
         xp, _ = numerics(problem, state)
-        tolerance = check_tolerance(self.tolerance, state.M.dtype)
+        tolerance = self.accuracy(problem)
         eps = xp.finfo(state.M.dtype).eps
         here = xp.append(state.M.reshape(-1), own.level)
         end = xp.eye(here.size, dtype=here.dtype)[-1]
@@ -133,7 +136,7 @@ class Continuation(AbstractExactSolver):
         own = state.own
         residual = residual_of(problem, state.M, state.M)
         unfinished = Result.running if stopped else Result.not_converged
-        arrived = (own.level >= 1) & (residual <= check_tolerance(self.tolerance, state.M.dtype))
+        arrived = (own.level >= 1) & (residual <= self.accuracy(problem))
         stats = {"residual": residual, "unique": own.unique, "level": own.level}
         return choose(arrived, Result.success, unfinished), stats
 

@@ -16,6 +16,10 @@ class Result(eqx.Enumeration):
         "A gradient or iterate was not finite; the last finite iterate is returned. Use a smaller step, or check "
         "the problem's scales; on an infinite horizon, start from a policy that keeps the world mean-square stable."
     )
+    undersampled = (
+        "The sample reached its limit before the standard error met the tolerance; the policy is returned with its "
+        "error: raise tolerance, or pass sampling=pc.SampleAverage(limit=...)."
+    )
     not_converged = (
         "The tolerance was not reached. The map may have no fixed point, or the method starts too far from one: try "
         "pc.StablePoint where repeated minimisation was used, another M0, pc.Continuation, or a larger tolerance."

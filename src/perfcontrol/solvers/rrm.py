@@ -4,11 +4,11 @@ from typing import Any
 
 import equinox as eqx
 
-from perfcontrol._checks import check_tolerance
 from perfcontrol._linalg import frobenius
 from perfcontrol._programs import Numbers, choose, numerics
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.response import residual_of, respond
+from perfcontrol.response.estimate import SampleAverage
 from perfcontrol.solvers.base import State, start
 from perfcontrol.solvers.exact_solver import AbstractExactSolver
 from perfcontrol.solvers.result import Result
@@ -28,15 +28,17 @@ class RRM(AbstractExactSolver):
     `residual` (relative natural residual of the last policy deployed: of M where the run converged), `unique`.
 
     Args:
-        tolerance: None for 1e-11 in float64, 1e-5 in float32.
+        tolerance: None for 1e-11 in float64, 1e-5 in float32; where responses are sampled, the relative standard
+            error of the answer, None for 1e-2.
         max_steps: at most so many minimisations.
+        sampling: how many paths sampled responses may use; None for `SampleAverage()`.
 
     References:
         Equation (RRM); Lemma on existence and uniqueness of M^PS.
     """
 
-    def __init__(self, tolerance: float | None = None, max_steps: int = 500):
-        super().__init__(tolerance, max_steps)
+    def __init__(self, tolerance: float | None = None, max_steps: int = 500, sampling: SampleAverage | None = None):
+        super().__init__(tolerance, max_steps, sampling)
 
     def init(self, problem: PerformativeProblem, M0: Any) -> State:
         xp, _ = numerics(M0)
@@ -44,7 +46,7 @@ class RRM(AbstractExactSolver):
         return start(M0, _Own(far, zero, xp.asarray(True), 1e8 * (1 + frobenius(M0))))
 
     def step(self, problem: PerformativeProblem, state: State, key: Any) -> State:
-        own, tolerance = state.own, check_tolerance(self.tolerance, state.M.dtype)
+        own, tolerance = state.own, self.accuracy(problem)
         response = respond(problem, state.M)
         following = response.M
         xp, _ = numerics(following)

@@ -38,7 +38,7 @@ def solve(
         problem: the problem.
         solver: `RSGD`, `RRM`, `StablePoint`, ...
         M0: feasible start, free parameters; None: the feasible policy nearest to zero.
-        key: JAX random key; required by solvers that sample.
+        key: JAX random key; required by solvers that sample, and by all where best responses cannot be had exactly.
         max_steps: overrides the solver's own number of steps.
         record: M -> any pytree of arrays, run inside the compiled loop and kept as `history`; default M itself.
         every: record every so many steps.
@@ -50,7 +50,8 @@ def solve(
         SolveError: the run failed and `throw` is True; its `.solution` is what was reached.
     """
     check_problem(problem)
-    check_instance("solver", solver, AbstractSolver, "pc.StablePoint()").check(problem)
+    solver = check_instance("solver", solver, AbstractSolver, "pc.StablePoint()").on(problem, key)
+    solver.check(problem)
     key = check_key(key) if solver.needs_key or key is not None else None
     every = check_integer("every", every, 1)
     for name, function in (("record", record), ("progress", progress)):

@@ -13,11 +13,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from perfcontrol._checks import check_tolerance
 from perfcontrol._linalg import frobenius, solve
 from perfcontrol._programs import Numbers, choose, cond, numerics, program, while_loop
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.response import Response, residual_of, respond, response_jacobian, response_pushforward
+from perfcontrol.response.estimate import SampleAverage
 from perfcontrol.response.projected import nearest
 from perfcontrol.solvers.base import AbstractSolver, State, start
 from perfcontrol.solvers.continuation import Continuation
@@ -52,21 +52,29 @@ class StablePoint(AbstractExactSolver):
     gaps), `rescued` (whether continuation found the answer; `steps` counts its steps, too, `history` does not).
 
     Args:
-        tolerance: None for 1e-11 in float64, 1e-5 in float32.
+        tolerance: None for 1e-11 in float64, 1e-5 in float32; where responses are sampled, the relative standard
+            error of the answer, None for 1e-2.
         max_steps: at most so many steps.
         rescue: whether to go on with continuation.
+        sampling: how many paths sampled responses may use; None for `SampleAverage()`.
     """
 
     rescues: bool = eqx.field(static=True)
 
-    def __init__(self, tolerance: float | None = None, max_steps: int = 60, rescue: bool = True):
-        super().__init__(tolerance, max_steps)
+    def __init__(
+        self,
+        tolerance: float | None = None,
+        max_steps: int = 60,
+        rescue: bool = True,
+        sampling: SampleAverage | None = None,
+    ):
+        super().__init__(tolerance, max_steps, sampling)
         self.rescues = rescue
 
     def rescue(self, problem: PerformativeProblem) -> AbstractSolver | None:
         bounded = problem.feasible_set.radius(problem.policy_shape) is not None
         held = math.prod(problem.policy_shape) <= CONTINUED
-        return Continuation(self.tolerance) if self.rescues and bounded and held else None
+        return Continuation(self.tolerance, sampling=self.sampling) if self.rescues and bounded and held else None
 
     def init(self, problem: PerformativeProblem, M0: Any) -> State:
         # The first step moves nowhere and evaluates M0.
@@ -101,7 +109,7 @@ class StablePoint(AbstractExactSolver):
         finite = xp.isfinite(gap) & xp.all(xp.isfinite(M))
         ratio = gap / xp.where(own.gap > 0, own.gap, 1)  # zero at the first step: a step of minimisation follows
         limit = xp.where(state.steps == 0, FAR * (1 + frobenius(M) + frobenius(response.M)), own.limit)
-        tolerance = check_tolerance(self.tolerance, state.M.dtype)
+        tolerance = self.accuracy(problem)
         scale = frobenius(M)
         done = gap <= 0.1 * tolerance * xp.where(scale > 0, scale, 1)
         # A Newton step that no longer helps has reached rounding, or is stuck: `finish` tells which by the residual.
@@ -121,7 +129,7 @@ class StablePoint(AbstractExactSolver):
         residual = residual_of(problem, state.M, state.M)
         unfinished = Result.running if stopped else Result.not_converged
         failed = choose(state.result == Result.nonfinite, Result.nonfinite, unfinished)
-        result = choose(residual <= check_tolerance(self.tolerance, state.M.dtype), Result.success, failed)
+        result = choose(residual <= self.accuracy(problem), Result.success, failed)
         return result, {
             "residual": residual,
             "unique": state.own.unique,
