@@ -11,7 +11,9 @@ from perfcontrol.costs import QuadraticCost
 from perfcontrol.perturbations import CovarianceOperator
 from perfcontrol.problem import PerformativeProblem
 
-SIMULATE = "Use pc.estimate_cost and pc.sample_gradient, which only simulate."
+SIMULATE = (
+    "Use pc.estimate_cost and pc.sample_gradient, which only simulate; best responses and solvers sample given key=."
+)
 
 
 class Loop(NamedTuple):

@@ -136,6 +136,13 @@ class AbstractPerturbation(eqx.Module):
     def check(self, policy_shape: tuple[int, int, int], horizon: int) -> None:
         """Raise InputError where this law does not fit a problem of that shape; looks at shapes only."""
 
+    def log_probability(self, draws: Draws, M: Array, horizon: int) -> Array | None:
+        """log P(draws) under M where draws of a fixed key stay put as M moves; None where they move with it, smoothly.
+
+        Sampled derivatives by the deployed policy then follow the probability (score function), else the draws.
+        """
+        return None
+
     def policy_free_mean(self, feasible_set: Any) -> bool:
         """Whether the family knows E Δ_t to be the same for every policy of the set."""
         return False

@@ -124,6 +124,11 @@ class FinitePerturbation(AbstractPerturbation):
         indices = jnp.sum(uniform * cumulative[:, -1:] >= cumulative, axis=-1)
         return _FiniteDraws(jnp.where(jnp.isnan(cumulative[:, -1]), self._count, indices), self.values)
 
+    def log_probability(self, draws: Draws, M: Array, horizon: int) -> Array:
+        assert isinstance(draws, _FiniteDraws)
+        chosen = jnp.take_along_axis(self.distribution(M, horizon), draws.indices[:, None], axis=1)
+        return jnp.sum(jnp.log(chosen))
+
     def mean(self, M: Array, horizon: int) -> Array:
         time = "t" if self.values.ndim == 4 else ""
         return jnp.einsum(f"tk,{time}knp->tnp", self.distribution(M, horizon), self.values)

@@ -13,7 +13,7 @@ from perfcontrol._linalg import frobenius
 from perfcontrol._programs import known, numerics, on_host
 from perfcontrol.costs import ConvexCost, QuadraticCost
 from perfcontrol.evaluate.rollout import Estimate, simulate
-from perfcontrol.problem import PerformativeProblem, check_problem
+from perfcontrol.problem import PerformativeProblem, check_end, check_problem
 from perfcontrol.response.quadratic import DENSE_LIMIT
 from perfcontrol.response.sampled import Sampled, Uncertainty, minimise, uncertainty
 
@@ -57,12 +57,13 @@ def is_exact(problem: PerformativeProblem) -> bool:
     if not isinstance(problem.cost, QuadraticCost):
         return False
     policy = jax.ShapeDtypeStruct(problem.lifted_shape, problem.dtype)
-    spread = eqx.filter_eval_shape(lambda law, M: law.covariance(M, problem.horizon), problem.perturbation, policy)
+    spread = eqx.filter_eval_shape(lambda law, M: law.covariance(M, problem.steps), problem.perturbation, policy)
     return spread is not None
 
 
 def check_sampling(problem: PerformativeProblem, tolerance: float | None) -> None:
     """Raise where sampled best responses cannot be had: not convex (on samples), or too large."""
+    check_end(problem)
     check_tolerance(TOLERANCE if tolerance is None else tolerance, problem.dtype)
     size = math.prod(problem.policy_shape)
     if size > DENSE_LIMIT:

@@ -99,8 +99,14 @@ def reaction(world: Sampled, M: Any, deployed: Any) -> Array:
 
     def one(key: Array) -> Array:
         def gradient(deployed: Array) -> Array:
-            drawn = draw_path(world, world.structure.lift(deployed), key)
-            return path_gradient(world, run_path(world, policy, *drawn)).reshape(-1)
+            reacting = world.structure.lift(deployed)
+            x0, w, draws = draw_path(world, reacting, key)
+            slope = path_gradient(world, run_path(world, policy, x0, w, draws)).reshape(-1)
+            log_probability = world.perturbation.log_probability(draws, reacting, world.horizon)
+            if log_probability is None:
+                return slope
+            # One in value; its derivative is the score.
+            return slope * jnp.exp(log_probability - jax.lax.stop_gradient(log_probability))
 
         return jax.jacfwd(gradient)(deployed).reshape(M.size, M.size)
 
