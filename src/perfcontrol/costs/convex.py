@@ -17,8 +17,9 @@ from perfcontrol.costs.convexity import check_convexity
 class ConvexCost(AbstractCost):
     """c_t(x, u) = discount^t function(t, x, u), with gradients by automatic differentiation.
 
-    Costs are simulated (`simulate`, `estimate_cost`, `sample_gradient`, `RSGD`); what is exact needs a QuadraticCost.
-    Convexity and the three constants are the user's word: theory takes them as declared, nothing here checks them.
+    Costs are simulated (`simulate`, `estimate_cost`, `sample_gradient`, `RSGD`); given a key, best responses, `RRM` and
+    `StablePoint` are sampled, too, after a look at convexity, smoothness and constants on simulated paths
+    (`check_convexity`). Elsewhere these are the user's word: theory takes them as declared.
 
     Args:
         function: (t, x, u) -> scalar, for an integer t = 0..T (traced), x (n,) and u (m,). A plain function is static;

@@ -40,7 +40,7 @@ class _Own(eqx.Module):
 class Continuation(AbstractExactSolver):
     """A performatively stable policy by continuation from M_0; for bounded sets, where repeated minimisation fails.
 
-    Needs a quadratic cost and known moments, and works with matrices of the policy's size: for up to 2048 free
+    Exact or sampled like `StablePoint`; works with matrices of the policy's size: for up to 2048 free
     parameters. On an unbounded set there may be no stable policy, or the curve may leave for infinity. Where
     constraints become active or cease to be, the curve has a kink: steps shrink there and turn to the far side's
     tangent. That they arrive is proved for smooth Φ only; through kinks it is what tests show. `.stats`:

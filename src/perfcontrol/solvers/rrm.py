@@ -24,6 +24,10 @@ class _Own(eqx.Module):
 class RRM(AbstractExactSolver):
     """M_{n+1} = Φ(M_n), exactly; ends when a step moves less than `tolerance` relative to ‖M‖.
 
+    For a general convex cost or unknown moments, `solve` takes a key, and Φ from sample averages with common random
+    numbers; `.stats` then has `standard_error` (policy_shape), `confidence_radius` (‖M - M^PS‖ is below it with 95 %
+    confidence), `samples`, too.
+
     `.stats`: `rate` (last ratio of moves, an estimate of the contraction rate; 0 where there was no second move),
     `residual` (relative natural residual of the last policy deployed: of M where the run converged), `unique`.
 

@@ -133,6 +133,8 @@ def from_host(run: Run) -> tuple[State, Any]:
         if progress is not None:
             progress(done, total)
         if state.result is not Result.running:  # known results are the members themselves
+            if done % every and len(history) <= total // every:  # what is repeated is where the run ended
+                history.append(_recorded(record, state.M))
             break
     history.append(_repeated(history[-1], total // every + 1 - len(history)))
     return state, _joined(history)

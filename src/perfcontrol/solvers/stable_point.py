@@ -44,9 +44,9 @@ class _Own(eqx.Module):
 class StablePoint(AbstractExactSolver):
     """The fixed point M^PS = Φ(M^PS), to a relative natural residual of `tolerance`.
 
-    Needs a quadratic cost and known moments; no sampling. Finds stable points at which repeated minimisation
-    diverges. Where Newton's method starts too far off and the set is bounded, `solve` goes on with
-    `pc.Continuation` from the same start (with known numbers only: not under jit or vmap).
+    Exact for a quadratic cost and known moments; else given a key, by sample averages (see `RRM`). Finds stable points
+    at which repeated minimisation diverges. Where Newton's method starts too far off and the set is bounded, `solve`
+    goes on with `pc.Continuation` from the same start (with known numbers only: not under jit or vmap).
 
     `.stats`: `residual` (relative natural residual), `unique` (of the best response, at M^PS), `rate` (last ratio of
     gaps), `rescued` (whether continuation found the answer; `steps` counts its steps, too, `history` does not).
