@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array
 
 from perfcontrol._checks import check_finite, fail
-from perfcontrol._linalg import along_time
+from perfcontrol._linalg import along_time, symmetrise
 from perfcontrol._programs import known, program
 from perfcontrol.evaluate.cost_to_go import World, world_of
 from perfcontrol.evaluate.impulses import constant_impulses, varying_impulses
@@ -57,9 +57,23 @@ def exact_gradient(problem: PerformativeProblem, M: Any, deployed: Any) -> Any:
 
 
 @program
-def total_gradient(problem: PerformativeProblem, M: Any) -> Array:
-    """d/dM C_T(M; M) in the free parameters."""
-    return jax.grad(lambda policy: exact_cost(problem, policy, policy))(M)
+def value_and_total_gradient(problem: PerformativeProblem, M: Any) -> tuple[Array, Array]:
+    """C_T(M; M) and d/dM C_T(M; M) in the free parameters."""
+    return jax.value_and_grad(lambda policy: exact_cost(problem, policy, policy))(M)
+
+
+@program
+def values_and_total_gradients(problem: PerformativeProblem, policies: Any) -> tuple[Array, Array]:
+    """The same of several policies, stacked along the first axis."""
+    return jax.vmap(lambda M: value_and_total_gradient(problem, M))(policies)
+
+
+@program
+def total_hessian(problem: PerformativeProblem, M: Any) -> Array:
+    """d²/dM² C_T(M; M) in the free parameters, (p, p)."""
+    _, push = jax.linearize(lambda policy: value_and_total_gradient(problem, policy)[1], M)
+    eye = jnp.eye(M.size, dtype=M.dtype).reshape(M.size, *M.shape)
+    return symmetrise(jax.lax.map(push, eye, batch_size=min(16, M.size)).reshape(M.size, M.size))
 
 
 def check_answer(what: str, answer: Any, problem: PerformativeProblem, deployed: Any) -> Array:
@@ -130,4 +144,4 @@ def expected_gradient(problem: PerformativeProblem, M: Any, *, deployed: Any = N
             "be left out for the total gradient",
             "The total derivative moves both policies together.",
         )
-    return check_answer("the total gradient", total_gradient(problem, M), problem, M)
+    return check_answer("the total gradient", value_and_total_gradient(problem, M)[1], problem, M)

@@ -10,6 +10,7 @@ from perfcontrol.response.respond import (
     response_hessian,
     response_jacobian,
     response_pushforward,
+    step_of,
 )
 
 __all__ = [
@@ -23,4 +24,5 @@ __all__ = [
     "response_hessian",
     "response_jacobian",
     "response_pushforward",
+    "step_of",
 ]

@@ -17,7 +17,7 @@ from jaxtyping import Array
 from perfcontrol._linalg import frobenius
 from perfcontrol._programs import known, numerics, on_host, program
 from perfcontrol.evaluate.cost_to_go import World, world_of
-from perfcontrol.evaluate.exact import check_answer, exact_gradient, weigh
+from perfcontrol.evaluate.exact import check_answer, exact_gradient, expected_gradient, weigh
 from perfcontrol.evaluate.loop import require_moments
 from perfcontrol.evaluate.reaction import reaction_jacobian
 from perfcontrol.evaluate.rollout import check_pair
@@ -150,32 +150,58 @@ def differentiable_response(problem: PerformativeProblem, deployed: Array) -> Ar
     return M + (corrected - jax.lax.stop_gradient(corrected))
 
 
-def natural_residual(problem: PerformativeProblem, M: Any, deployed: Any) -> Any:
-    """‖M - Proj(M - η g)‖_F relative to ‖M‖_F + η ‖g(0)‖_F, η = 1/‖Hessian‖; g by a pass over time of its own."""
+def _step(problem: PerformativeProblem, world: World, form: Any) -> Any:
+    """η = 1/‖Hessian‖."""
+    return _separable_method(problem, world, form).step if isinstance(form, Factors) else form.step
+
+
+def natural_residual(problem: PerformativeProblem, M: Any, deployed: Any, gradient: Any = None) -> Any:
+    """‖M - Proj(M - η g)‖_F relative to ‖M‖_F + η ‖∇_1 C_T(0)‖_F, η = 1/‖Hessian‖.
+
+    g is the gradient given, or ∇_1 C_T(M; deployed) by a pass over time of its own.
+    """
     world = world_of(problem, deployed)
     form = _shape_of_cost(problem, world)
     xp, _ = numerics(form, M)
-    at_M = weigh(problem, world, M)[1]
+    at_M = weigh(problem, world, M)[1] if gradient is None else gradient
     sound = _sound((form, at_M))
     if known(sound) and not sound:
         return xp.asarray(xp.inf, at_M.dtype)
-    step = _separable_method(problem, world, form).step if isinstance(form, Factors) else form.step
+    step = _step(problem, world, form)
     moved = frobenius(M - nearest(problem.feasible_set, M - step * at_M))
     scale = frobenius(M) + step * frobenius(form.linear)
     return xp.where(sound, moved / xp.where(scale > 0, scale, 1), xp.inf)
 
 
+def _step_at(problem: PerformativeProblem, deployed: Any) -> Any:
+    world = world_of(problem, deployed)
+    form = _shape_of_cost(problem, world)
+    sound = _sound(form)
+    if known(sound) and not sound:
+        return np.asarray(np.nan, problem.dtype)
+    return _step(problem, world, form)
+
+
 _residual_in_one_program = program(natural_residual)
+_step_in_one_program = program(_step_at)
 
 
-def residual_of(problem: PerformativeProblem, M: Any, deployed: Any) -> Any:
+def residual_of(problem: PerformativeProblem, M: Any, deployed: Any, gradient: Any = None) -> Any:
     """`natural_residual`; from the host where that can be, else as one program."""
     if isinstance(problem, Sampled):
         return sampled_residual(problem, on_host(M), on_host(deployed))
     if known(problem, M, deployed) and _held(problem):
         with np.errstate(all="ignore"):
-            return natural_residual(problem, on_host(M), on_host(deployed))
-    return _residual_in_one_program(problem, M, deployed)
+            return natural_residual(problem, on_host(M), on_host(deployed), gradient)
+    return _residual_in_one_program(problem, M, deployed, gradient)
+
+
+def step_of(problem: PerformativeProblem, deployed: Any) -> Any:
+    """η = 1/‖Hessian of C_T(·; deployed)‖: the length of a safe gradient step; NaN where the world overflows."""
+    if known(problem, deployed) and _held(problem):
+        with np.errstate(all="ignore"):
+            return _step_at(problem, on_host(deployed))
+    return _step_in_one_program(problem, deployed)
 
 
 def best_response(
@@ -214,16 +240,23 @@ def best_response(
     return check_answer("the best response", respond(problem, deployed).M, problem, deployed)
 
 
-def residual(problem: PerformativeProblem, M: Any, *, deployed: Any = None) -> Array:
-    """Relative natural residual ‖M - Proj(M - ηg)‖_F / (‖M‖_F + η‖g(0)‖_F), g = ∇_1 C_T(M; deployed), η = 1/‖Hessian‖.
+def residual(problem: PerformativeProblem, M: Any, *, deployed: Any = None, total: bool = False) -> Array:
+    """Relative natural residual ‖M - Proj(M - ηg)‖_F / (‖M‖_F + η‖∇_1 C_T(0)‖_F), η = 1/‖Hessian‖.
 
-    Zero exactly at a best response to `deployed`; with `deployed=None` (M itself) at a performatively stable policy.
+    With g = ∇_1 C_T(M; deployed) it is zero exactly at a best response to `deployed`; with `deployed=None` (M itself)
+    at a performatively stable policy. With `total=True` g is the derivative of C_T(M; M), and the residual is zero at a
+    performatively optimal policy (and wherever else that cost is stationary).
 
     Args:
         problem: with a QuadraticCost and a perturbation of known moments.
         M: free policy parameters, `problem.policy_shape`.
         deployed: likewise, the policy that the world reacts to; None for M itself.
+        total: whether both policies move together.
+
+    Raises:
+        InputError: as `best_response`; `total=True` together with another deployed policy.
     """
     M, reacting = check_pair(problem, M, deployed)
     require_moments(problem)
-    return check_answer("the residual", residual_of(problem, M, reacting), problem, reacting)
+    gradient = expected_gradient(problem, M, deployed=deployed, total=True) if total else None
+    return check_answer("the residual", residual_of(problem, M, reacting, gradient), problem, reacting)

@@ -5,6 +5,7 @@ from perfcontrol.solvers.base import AbstractSolver, Solution, SolveError
 from perfcontrol.solvers.confidence import ConfidenceRegion, confidence_region
 from perfcontrol.solvers.continuation import Continuation
 from perfcontrol.solvers.gradients import Exact, Pathwise
+from perfcontrol.solvers.optimum import PerformativeOptimum
 from perfcontrol.solvers.result import Result
 from perfcontrol.solvers.rrm import RRM
 from perfcontrol.solvers.rsgd import RSGD
@@ -25,6 +26,7 @@ __all__ = [
     "InverseStep",
     "Lazy",
     "Pathwise",
+    "PerformativeOptimum",
     "PowerStep",
     "Result",
     "Solution",
