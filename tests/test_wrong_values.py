@@ -156,6 +156,10 @@ WRONG = {
         "transform by name": (lambda: pc.RSGD(10, 0.1, transform="adam"), "transform", "optax"),
         "never deployed": (lambda: pc.Lazy(0), "steps", "at least 1"),
         "no delay": (lambda: pc.InverseStep(1.0, 0.0), "phi2", "positive"),
+        "step that falls too fast": (lambda: pc.PowerStep(0.1, 1.5), "alpha", "pc.InverseStep"),
+        "all burnt in": (lambda: pc.Average(burn_in=1.0), "burn_in", "0.25"),
+        "region without a run": (lambda: pc.confidence_region(M), "solution", "average=True"),
+        "no start": (lambda: pc.PerformativeOptimum(starts=0), "starts", "at least 1"),
         "negative tolerance": (lambda: pc.RRM(tolerance=-1), "tolerance", "got -1"),
         "tolerance by name": (lambda: pc.StablePoint(tolerance="small"), "tolerance", "'small'"),
         "tolerance below rounding": (lambda: pc.solve(problem, pc.RRM(tolerance=1e-30)), "tolerance", "can reach"),
@@ -244,7 +248,7 @@ def test_wrong_value_is_refused_by_the_name_of_its_argument_with_a_remedy(case):
 
 
 # What the package gives back, and what takes no value that could be wrong.
-GIVEN_BACK = {"Certificate", "Estimate", "Fit", "Solution", "StateMoments", "Trajectories"}
+GIVEN_BACK = {"Certificate", "ConfidenceRegion", "Estimate", "Fit", "Solution", "StateMoments", "Trajectories"}
 
 
 def test_every_public_name_that_takes_values_has_a_row():
