@@ -1,0 +1,108 @@
+"""Sampled gradients: NumPy baselines, ours on one path and on many, and how many paths are best worked on together."""
+
+import jax
+import numpy as np
+from jax.sharding import Mesh
+from jax.sharding import PartitionSpec as P
+
+import perfcontrol as pc
+from benchmarks import numpy_gradients
+from benchmarks.measure import Row, compiled, median_time, side_by_side
+from benchmarks.problems import policy_of
+from perfcontrol.evaluate.adjoint import mean_path_gradient, path_gradient
+from perfcontrol.evaluate.rollout import lanes, sample_path
+from perfcontrol.experiments.batches import in_single_precision
+
+SEEDS = 288
+LANES = (4, 8, 16)
+
+
+def batch_gradients(
+    problem: pc.PerformativeProblem, M: jax.Array, keys: jax.Array, together: int | None = None
+) -> jax.Array:
+    """A sampled path gradient for every key, on one core, so many paths `together` (the number that ours chooses)."""
+    together = together or lanes(problem)
+    return jax.lax.map(lambda key: mean_path_gradient(problem, M, M, key, 1), keys, batch_size=together)
+
+
+def gradients_on_all_cores(problem: pc.PerformativeProblem, M: jax.Array, keys: jax.Array) -> jax.Array:
+    """The same, the keys shared out over the host's cores."""
+    mesh = Mesh(np.array(jax.devices()), ("keys",))
+    spread = jax.shard_map(
+        lambda keys: batch_gradients(problem, M, keys), mesh=mesh, in_specs=P("keys"), out_specs=P("keys"),
+        check_vma=False,
+    )  # fmt: skip
+    return spread(keys)
+
+
+def seed_rows(name: str, label: str, problem: pc.PerformativeProblem, M: jax.Array, printed: float) -> list[Row]:
+    """Seconds per seed of `SEEDS`, on one core and on all."""
+    rows: list[Row] = []
+    keys = jax.random.split(jax.random.key(3), SEEDS)
+    for function, where in ((batch_gradients, "one core"), (gradients_on_all_cores, f"{len(jax.devices())} cores")):
+        call, build = compiled(function, problem, M, keys)
+        took = median_time(call) / SEEDS
+        note = f"{printed / took:.0f} (compiled in {build:.1f} s)"
+        rows.append((name, f"ours, the same per seed of {SEEDS}, {label}, {where}", took, note))
+    return rows
+
+
+def numpy_baselines(problem: pc.PerformativeProblem, M: jax.Array) -> tuple[float, float]:
+    """Seconds of (a) and (b) on one path; both are checked against ours first."""
+    path = sample_path(problem, problem.lift(M), problem.lift(M), jax.random.key(1))
+    by_state, by_input = problem.cost.path_gradients(path.x, path.u)
+    arrays = (problem.system.A, problem.system.B, problem.gain, path.draws.dense(), path.x, path.w)
+    host = [np.asarray(array, float) for array in arrays]
+    rest = (problem.memory, np.asarray(by_state), np.asarray(by_input))
+    ours = np.asarray(path_gradient(problem, path))
+    flat = np.concatenate(list(ours), axis=1)
+    np.testing.assert_allclose(numpy_gradients.printed(*host, *rest), flat, rtol=1e-8, atol=1e-8 * np.abs(flat).max())
+    np.testing.assert_allclose(numpy_gradients.adjoint(*host, *rest), ours, rtol=1e-8, atol=1e-8 * np.abs(flat).max())
+    slow = median_time(lambda: numpy_gradients.printed(*host, *rest))
+    return slow, median_time(lambda: numpy_gradients.adjoint(*host, *rest))
+
+
+def gradient_rows(name: str, problem: pc.PerformativeProblem) -> list[Row]:
+    """NumPy against ours, one path and many seeds, both precisions."""
+    M = policy_of(problem)
+    printed, adjoint = numpy_baselines(problem, M)
+    rows: list[Row] = [
+        (name, "(a) printed formula, NumPy", printed, "1"),
+        (name, "(b) adjoint, NumPy", adjoint, f"{printed / adjoint:.1f}"),
+    ]
+    for label, p in (("float64", problem), ("float32", in_single_precision(problem))):
+        policy = M.astype(p.dtype)
+        path = sample_path(p, p.lift(policy), p.lift(policy), jax.random.key(1))
+        call, build = compiled(path_gradient, p, path)
+        took = median_time(call)
+        rows.append(
+            (name, f"ours, gradient of a path, {label}", took, f"{printed / took:.0f} (compiled in {build:.1f} s)")
+        )
+        call, build = compiled(lambda p, M, key: mean_path_gradient(p, M, M, key, 1), p, policy, jax.random.key(2))
+        took = median_time(call)
+        rows.append(
+            (
+                name,
+                f"ours, draw, simulate and gradient, {label}",
+                took,
+                f"{printed / took:.0f} (compiled in {build:.1f} s)",
+            )
+        )
+        rows += seed_rows(name, label, p, policy, printed)
+    return rows
+
+
+def lane_rows(name: str, label: str, problem: pc.PerformativeProblem, M: jax.Array, printed: float) -> list[Row]:
+    """Seconds per seed of `SEEDS` on one core, by the number of paths that are worked on together."""
+    keys = jax.random.split(jax.random.key(3), SEEDS)
+    calls = [compiled(batch_gradients, problem, M, keys, together)[0] for together in LANES]
+    took = np.asarray(side_by_side(calls)) / SEEDS
+    return [
+        (
+            name,
+            f"{together} paths together, {label}, one core",
+            seconds,
+            f"{printed / seconds:.0f}" + (" (chosen)" if together == lanes(problem) else ""),
+        )
+        for together, seconds in zip(LANES, took, strict=True)
+    ]
