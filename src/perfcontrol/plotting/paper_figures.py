@@ -133,7 +133,8 @@ def figure_cure(cure: xarray.Dataset, sweep: xarray.Dataset, settings: Reproduce
                 floor = float(cure["floor_smaller"].sel(order=order))
                 middle.axhline(floor, color=colour, linestyle=(0, (4, 3)), linewidth=0.8)
         middle.plot([], [], color="#555555", linestyle=style, label=label)
-    middle.plot([], [], color="#555555", linestyle=(0, (4, 3)), linewidth=0.8, label="its mean-square floor")
+        if name == "smaller":
+            middle.plot([], [], color="#555555", linestyle=(0, (4, 3)), linewidth=0.8, label="its mean-square floor")
     _log_axes(middle)
     middle.set_title("constant steps (medians)")
     middle.set_ylim(bottom=middle.get_ylim()[0] / 12)
