@@ -84,7 +84,7 @@ def check_answer(what: str, answer: Any, problem: PerformativeProblem, deployed:
     raise fail(
         "deployed",
         f"a policy under which second moments grow by the factor {radius:.6g} a stage (spectral radius)",
-        "keep the world mean-square stable, with a spectral radius below 1",
+        "keep the world mean-square stable, with a spectral radius clearly below 1",
         "Deploy a policy of smaller norm, or use a stabilising gain, as of pc.design_gain.",
     )
 
