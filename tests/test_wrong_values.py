@@ -188,6 +188,10 @@ WRONG = {
             "deployed",
             "(1, 2, 3)",
         ),
+        "number of samples alone": (lambda: pc.StablePoint(sampling=64), "sampling", "SampleAverage"),
+        "no paths": (lambda: pc.SampleAverage(0), "samples", "at least 2"),
+        "sampled response without key": (lambda: pc.estimate_response(problem, M), "key", "jax.random.key(0)"),
+        "sampled response to nothing": (lambda: pc.estimate_response(problem, None, key=key), "deployed", "got None"),
         "response to nothing": (lambda: pc.best_response(problem, None), "deployed", "got None"),
         "two worlds at once": (
             lambda: pc.expected_gradient(problem, M, deployed=M, total=True),

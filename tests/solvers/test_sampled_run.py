@@ -8,7 +8,7 @@ import pytest
 import perfcontrol as pc
 from tests.contracts.solver import SolverContract
 from tests.evaluate.cases import replaced
-from tests.solvers.problems import drifting, strongly_performative
+from tests.solvers.problems import DEVIATION, MEAN, drifting, performative_prediction, strongly_performative
 from tests.tools import assert_refused, normal
 
 FEW = pc.SampleAverage(64, 64)
@@ -55,6 +55,21 @@ def test_stable_policy_at_which_repeated_minimisation_runs_away_is_found_by_samp
     assert within(solution, exact)
     ended = pc.solve(as_function(problem), pc.RRM(0.1, max_steps=20), key=jax.random.key(1), throw=False)
     assert ended.result != pc.Result.success
+
+
+@pytest.mark.parametrize("sensitivity", [0.8, -3.0], ids=["contracts slowly", "expands"])
+def test_reported_error_of_performative_prediction_is_its_closed_form(sensitivity):
+    """Φ_N(M) = z̄ + sensitivity M for the mean z̄ of N signs of size 0.1, amplified by 1 / (1 - sensitivity)."""
+
+    def last_stage(t, x, u):
+        return jnp.where(t == 2, 0.5, 0.0) * x[0] ** 2
+
+    problem = as_function(performative_prediction(sensitivity), last_stage)
+    solution = pc.solve(problem, pc.StablePoint(), key=jax.random.key(6))
+    expected = DEVIATION / np.sqrt(float(solution.stats["samples"])) / (1 - sensitivity)
+    assert float(solution.stats["standard_error"][0, 0, 0]) == pytest.approx(expected, rel=0.02)
+    assert float(solution.stats["confidence_radius"]) == pytest.approx(1.96 * expected, rel=0.03)
+    assert abs(float(solution.M[0, 0, 0]) - MEAN / (1 - sensitivity)) <= 3 * expected
 
 
 def test_sample_grows_until_the_error_meets_the_tolerance_and_says_so_where_it_may_not():

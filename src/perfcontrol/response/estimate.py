@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from perfcontrol._checks import check_finite, check_integer, check_key, check_tolerance, fail
+from perfcontrol._checks import check_finite, check_instance, check_integer, check_key, check_tolerance, fail
 from perfcontrol._linalg import frobenius
 from perfcontrol._programs import known, numerics, on_host
 from perfcontrol.costs import ConvexCost, QuadraticCost
@@ -50,6 +50,11 @@ class SampleAverage(eqx.Module):
         xp, _ = numerics(samples, excess)
         doublings = xp.clip(xp.ceil(2 * xp.log2(1.05 * excess)), 1, 30)
         return xp.asarray(xp.minimum(samples * 2.0**doublings, self.limit), samples.dtype)
+
+
+def as_sampling(value: Any) -> SampleAverage:
+    """`value` itself; the default for None."""
+    return SampleAverage() if value is None else check_instance("sampling", value, SampleAverage, "pc.SampleAverage()")
 
 
 def is_exact(problem: PerformativeProblem) -> bool:
@@ -111,7 +116,7 @@ def estimate_response(
         Shapiro, Dentcheva and Ruszczyński, Lectures on Stochastic Programming, chapter 5.
     """
     deployed, key = check_problem(problem).check_policy("deployed", deployed), check_key(key)
-    sampling = SampleAverage() if sampling is None else sampling
+    sampling = as_sampling(sampling)
     check_sampling(problem, tolerance)
     if not known(problem, deployed, key):
         world = Sampled(problem, key, jnp.asarray(sampling.samples))

@@ -7,7 +7,7 @@ import equinox as eqx
 from perfcontrol._checks import check_integer, check_key, check_positive_tolerance, check_tolerance
 from perfcontrol.evaluate.loop import require_moments
 from perfcontrol.problem import PerformativeProblem
-from perfcontrol.response.estimate import TOLERANCE, SampleAverage, is_exact
+from perfcontrol.response.estimate import TOLERANCE, SampleAverage, as_sampling, is_exact
 from perfcontrol.response.sampled import Sampled
 from perfcontrol.solvers.base import AbstractSolver
 from perfcontrol.solvers.sampled_run import SampledRun
@@ -31,7 +31,7 @@ class AbstractExactSolver(AbstractSolver):
     def __init__(self, tolerance: float | None, max_steps: int, sampling: SampleAverage | None = None):
         self.tolerance = check_positive_tolerance(tolerance)
         self.limit = check_integer("max_steps", max_steps, 1)
-        self.sampling = SampleAverage() if sampling is None else sampling
+        self.sampling = as_sampling(sampling)
 
     @property
     def max_steps(self) -> int:
