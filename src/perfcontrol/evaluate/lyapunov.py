@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-DENSE = 40  # n up to which the system is held as a matrix
+DENSE = 24  # n up to which the system is held as a matrix
 SERIES = 50_000  # terms of the series at most
 
 Operator = Callable[[Array], Array]
