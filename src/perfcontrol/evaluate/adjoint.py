@@ -6,6 +6,7 @@ The same numbers as the paper's double sum (Appendix B, "grad M ct"), which cost
 Algorithm 1 leaves out of its own objective, is included.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -108,19 +109,27 @@ def recover_noise(
     return x[1:] - jnp.einsum("tij,tj->ti", A, x[:-1]) - input_term(problem.system.B, u)
 
 
+def over_paths(problem: PerformativeProblem, one: Callable[[Array], Any], key: Key[Array, ""], samples: int) -> Any:
+    """What `one` makes of each of `samples` keys, with a leading axis; pure, for use inside compiled loops."""
+    if samples == 1:
+        return jax.tree.map(lambda leaf: leaf[None], one(key))
+    return jax.lax.map(
+        lambda index: one(jax.random.fold_in(key, index)),
+        jnp.arange(samples),
+        batch_size=min(lanes(problem), samples),
+    )
+
+
 def mean_path_gradient(
     problem: PerformativeProblem, M: Array, deployed: Array, key: Key[Array, ""], samples: int
 ) -> Array:
     """Mean over `samples` paths of ∇_1 along each path; pure, for use inside compiled loops."""
     policy, reacting = problem.structure.lift(M), problem.structure.lift(deployed)
 
-    def one(index: Array) -> Array:
-        path_key = key if samples == 1 else jax.random.fold_in(key, index)
+    def one(path_key: Array) -> Array:
         return path_gradient(problem, sample_path(problem, policy, reacting, path_key))
 
-    if samples == 1:
-        return one(jnp.zeros((), int))
-    return jnp.mean(jax.lax.map(one, jnp.arange(samples), batch_size=min(lanes(problem), samples)), axis=0)
+    return jnp.mean(over_paths(problem, one, key, samples), axis=0)
 
 
 _compiled_mean_path_gradient = program(mean_path_gradient, on_device=True)

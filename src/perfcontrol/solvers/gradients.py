@@ -1,4 +1,6 @@
-"""How RSGD gets a gradient ∇_1 C_T(M; deployed)."""
+"""How RSGD gets a gradient ∇_1 C_T(M; deployed): the interface, the paper's estimator, the expectation."""
+
+import abc
 
 import equinox as eqx
 from jaxtyping import Array, Key
@@ -9,11 +11,26 @@ from perfcontrol.evaluate.loop import require_moments
 from perfcontrol.problem import PerformativeProblem
 
 
-class Pathwise(eqx.Module):
-    """From `batch` simulated paths, noise and perturbations observed: the paper's estimator (Appendix B)."""
+class AbstractGradient(eqx.Module):
+    """A way to a gradient; samples unless it says otherwise, and then applies to every problem."""
+
+    @property
+    def needs_key(self) -> bool:
+        """Whether it draws random numbers."""
+        return True
 
     def check(self, problem: PerformativeProblem) -> None:
-        """Every problem can be simulated."""
+        """Raise InputError where it does not apply: every problem can be simulated."""
+
+    @abc.abstractmethod
+    def __call__(
+        self, problem: PerformativeProblem, M: Array, deployed: Array, key: Key[Array, ""], batch: int
+    ) -> Array:
+        """The gradient in the free parameters, from `batch` paths of the world that reacts to `deployed`."""
+
+
+class Pathwise(AbstractGradient):
+    """From `batch` simulated paths, noise and perturbations observed: the paper's estimator (Appendix B)."""
 
     def __call__(
         self, problem: PerformativeProblem, M: Array, deployed: Array, key: Key[Array, ""], batch: int
@@ -21,8 +38,12 @@ class Pathwise(eqx.Module):
         return mean_path_gradient(problem, M, deployed, key, batch)
 
 
-class Exact(eqx.Module):
+class Exact(AbstractGradient):
     """The expectation itself: repeated gradient descent, the mean field of RSGD. The key is not used."""
+
+    @property
+    def needs_key(self) -> bool:
+        return False
 
     def check(self, problem: PerformativeProblem) -> None:
         """Needs known moments and a quadratic cost."""

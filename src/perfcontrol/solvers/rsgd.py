@@ -13,7 +13,7 @@ from perfcontrol.evaluate.rollout import cut_off
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.solvers.averaging import Average, Tally, as_average
 from perfcontrol.solvers.base import AbstractSolver, State, start
-from perfcontrol.solvers.gradients import Exact, Pathwise
+from perfcontrol.solvers.gradients import Pathwise
 from perfcontrol.solvers.result import Result
 from perfcontrol.solvers.schedules import Greedy
 from perfcontrol.solvers.step_sizes import as_step_size, size_of
@@ -40,7 +40,8 @@ class RSGD(AbstractSolver):
         steps: N ≥ 1.
         step_size: a number, `pc.InverseStep(phi1, phi2)`, `pc.PowerStep(eta, alpha)`, or a function n -> η_n.
         batch: paths per step.
-        gradient: `pc.Pathwise()`, or `pc.Exact()` for the mean field.
+        gradient: `pc.Pathwise()`; `pc.Exact()` for the mean field, which is repeated gradient descent;
+            `pc.EstimatedDynamics()` where perturbations are not observed; `pc.TwoPoint(radius)` where only costs are.
         schedule: `pc.Greedy()`, or `pc.Lazy(k)` to deploy every k-th iterate.
         transform: an optax-like gradient transformation (`init`, `update`), applied before the step size.
         truncation: T of the paths, for an infinite horizon and only there; gradients are then per stage, with a bias
@@ -108,7 +109,7 @@ class RSGD(AbstractSolver):
 
     @property
     def needs_key(self) -> bool:
-        return not isinstance(self.gradient, Exact)
+        return getattr(self.gradient, "needs_key", True)
 
     def check(self, problem: PerformativeProblem) -> None:
         self.gradient.check(problem)
