@@ -158,6 +158,8 @@ WRONG = {
         "no delay": (lambda: pc.InverseStep(1.0, 0.0), "phi2", "positive"),
         "step that falls too fast": (lambda: pc.PowerStep(0.1, 1.5), "alpha", "pc.InverseStep"),
         "all burnt in": (lambda: pc.Average(burn_in=1.0), "burn_in", "0.25"),
+        "points that coincide": (lambda: pc.TwoPoint(0.0), "radius", "0.1"),
+        "negative ridge": (lambda: pc.EstimatedDynamics(-1.0), "ridge", "1e-6"),
         "region without a run": (lambda: pc.confidence_region(M), "solution", "average=True"),
         "no start": (lambda: pc.PerformativeOptimum(starts=0), "starts", "at least 1"),
         "negative tolerance": (lambda: pc.RRM(tolerance=-1), "tolerance", "got -1"),
