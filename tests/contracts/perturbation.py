@@ -198,6 +198,16 @@ class PerturbationContract:
             lower = np.abs(first.mean(axis=0) - second.mean(axis=0)) - 5 * error
             assert np.all(lower.max(axis=-1) <= np.asarray(sensitivity) * distance * (1 + 1e-9) + 1e-12)
 
+    def test_mean_moves_as_its_derivative_says(self):
+        law, policies, _ = self.drawn()
+        derivative = law.mean_derivative()
+        if derivative is None:
+            pytest.skip("the mean is not known to be affine")
+        for M in policies[1:]:
+            moved = law.mean(M, self.horizon) - law.mean(policies[0], self.horizon)
+            by_derivative = jnp.tensordot(derivative, M - policies[0], 3)
+            assert_close(moved, jnp.broadcast_to(by_derivative, moved.shape))
+
     def test_mean_is_the_same_everywhere_where_it_is_said_to_be_policy_free(self):
         law, policies, _ = self.drawn()
         if not law.policy_free_mean(self.lifted_set()):

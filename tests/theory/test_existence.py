@@ -11,6 +11,7 @@ from perfcontrol.theory.assumptions import weakest
 from perfcontrol.theory.existence import constant_mean
 from tests.theory.problems import random_problem
 
+pytestmark = pytest.mark.float32
 SLOPE = 0.1 * np.ones((2, 2, 1, 2))
 
 

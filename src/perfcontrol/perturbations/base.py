@@ -147,6 +147,10 @@ class AbstractPerturbation(eqx.Module):
         """Whether the family knows E Δ_t to be the same for every policy of the set."""
         return False
 
+    def mean_derivative(self) -> Array | None:
+        """d E Δ_t/dM where it is the same at every policy, (T, n, p, memory, m, n) or without T; else None."""
+        return None
+
 
 def zero_mean(M: Array, horizon: int, columns: int) -> Array:
     """Θ_t = 0."""

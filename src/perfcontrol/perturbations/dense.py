@@ -158,7 +158,14 @@ class DensePerturbation(AbstractPerturbation):
         return _ColouredCovariance(scales, self._vector(M).covariance.reshape(*shape, *shape))
 
     def policy_free_mean(self, feasible_set: Any) -> bool:
-        return (self.law is None or self.scale.constant) and (self.mean_map is None or self.mean_map.constant)
+        return self._scale_keeps_mean and (self.mean_map is None or self.mean_map.constant)
+
+    def mean_derivative(self) -> Array | None:
+        return self.mean_map.derivative() if self.mean_map is not None and self._scale_keeps_mean else None
+
+    @property
+    def _scale_keeps_mean(self) -> bool:
+        return self.law is None or self.scale.constant
 
     def bound(self, feasible_set: Any, horizon: int) -> Array | None:
         """sup ‖mean‖ + sup ‖scale Z‖_F; known where the maps know their range and the law is bounded."""

@@ -147,6 +147,9 @@ class DirectionalPerturbation(AbstractPerturbation):
     def policy_free_mean(self, feasible_set: Any) -> bool:
         return self.mean_map is None or self.mean_map.constant
 
+    def mean_derivative(self) -> Array | None:
+        return None if self.mean_map is None else self.mean_map.derivative()
+
     def bound(self, feasible_set: Any, horizon: int) -> Array | None:
         """Σ_k sup|scale_k| sup|ζ| ‖D_k‖ + sup‖mean‖; known where the maps know their range."""
         scales = self.scale.largest(feasible_set)

@@ -1,6 +1,7 @@
 """Whether a stable policy exists, how fast the methods reach it, and which step is safe; each with how it is known.
 
-Host-level: NumPy and SciPy around the exact engine; nothing here promises to work under jit or vmap.
+Host-level: NumPy and SciPy around the exact engine, in double precision also where the problem is in single precision
+(`precision`); nothing here promises to work under jit or vmap.
 """
 
 from perfcontrol.evaluate.reaction import reaction_jacobian

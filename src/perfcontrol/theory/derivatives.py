@@ -24,6 +24,7 @@ from perfcontrol.response.affine import tangent_space
 from perfcontrol.response.projected import projection_slope
 from perfcontrol.systems import LinearSystem
 from perfcontrol.theory.facts import nearest_to_zero
+from perfcontrol.theory.precision import in_double
 
 DENSE_LIMIT = 1500  # free parameters up to which p × p matrices are built
 
@@ -46,6 +47,7 @@ def obstacles(problem: PerformativeProblem) -> list[str]:
     return missing
 
 
+@in_double
 def hessian(problem: PerformativeProblem, deployed: Any) -> np.ndarray:
     """𝐇 = ∂_1 g under the deployed policy, (p, p) symmetric."""
     return np.asarray(response_hessian(problem, world_of(problem, on_host(deployed))), dtype=float)
@@ -82,6 +84,7 @@ def hessian_without_reaction(problem: PerformativeProblem, weights: np.ndarray |
     return np.asarray(response_hessian(problem, world), dtype=float)
 
 
+@in_double
 def projection_derivative(problem: PerformativeProblem, point: Any) -> np.ndarray:
     """The derivative (p, p) of the projection onto the feasible set at `point`."""
     return np.asarray(projection_slope(problem.feasible_set, on_host(point)), dtype=float)

@@ -10,7 +10,6 @@ Two fixed-point arguments (docs: theory, section on existence), neither of which
 
 from typing import NamedTuple
 
-import equinox as eqx
 import numpy as np
 
 from perfcontrol.costs import QuadraticCost
@@ -19,6 +18,7 @@ from perfcontrol.problem import PerformativeProblem
 from perfcontrol.theory.assumptions import Assumption, Status, reaction_status, word_of
 from perfcontrol.theory.derivatives import hessian_without_reaction, tangent_basis
 from perfcontrol.theory.facts import facts, in_free_parameters
+from perfcontrol.theory.precision import in_double
 
 
 class Existence(NamedTuple):
@@ -45,6 +45,7 @@ def reaction_is_continuous(problem: PerformativeProblem) -> bool:
     return not isinstance(law, SampledPerturbation) and type(law).__module__.startswith("perfcontrol.")
 
 
+@in_double
 def existence(problem: PerformativeProblem) -> Existence:
     """True with the argument that gives it, or None with the reason why neither argument applies."""
     if not problem.is_finite:
@@ -97,9 +98,8 @@ def constant_mean(problem: PerformativeProblem) -> bool:
     law = problem.perturbation
     if law.policy_free_mean(problem.lifted_set):
         return True
-    mean_map = getattr(law, "mean_map", None)
-    derivative = None if mean_map is None else mean_map.derivative()
-    if derivative is None or not eqx.tree_at(lambda law: law.mean_map, law, None).policy_free_mean(problem.lifted_set):
+    derivative = law.mean_derivative()
+    if derivative is None:
         return False
     slopes = in_free_parameters(problem, derivative).astype(float)
     along_set = np.abs(slopes @ tangent_basis(problem))

@@ -13,6 +13,7 @@ from jaxtyping import Array
 from perfcontrol._checks import check_integer, check_key, fail
 from perfcontrol.problem import PerformativeProblem, check_problem
 from perfcontrol.theory.assumptions import Status
+from perfcontrol.theory.precision import in_double
 
 METHODS = ("analytic", "coupling", "transport")
 
@@ -32,6 +33,7 @@ class SensitivityEstimate:
     remark: str
 
 
+@in_double
 def estimate_sensitivity(
     problem: PerformativeProblem,
     *,

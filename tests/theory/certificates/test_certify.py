@@ -280,6 +280,8 @@ def with_scale(scale, **others):
         ("rigorous", lambda: with_scale(np.ones(2), noise=pc.Gaussian(np.zeros(2), np.eye(2))), "noise_bound=2.0"),
         ("global", lambda: with_scale(lambda M: 0.1 * jnp.ones(2)), "scale_range=(0.0, 1.0, 0.5)"),
         ("global", lambda: with_scale(lambda M: 0.1 * jnp.ones(2)), "pc.Affine(offset, slope)"),
+        ("global", lambda: with_scale(lambda M: 0.1 * jnp.ones(2)), "pc.Norm(offset, weight)"),
+        ("rigorous", lambda: with_scale(lambda M: 0.1 * jnp.ones(2)), "pc.Norm(offset, weight)"),
         (
             "paper",
             lambda: with_scale(np.ones(2), gain=0, system=pc.LinearSystem(2 * np.eye(2), np.ones((2, 1)))),

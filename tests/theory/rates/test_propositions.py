@@ -7,6 +7,8 @@ import perfcontrol as pc
 from perfcontrol.theory import sensitivity_envelope, sum_threshold
 from tests.theory.problems import random_problem
 
+pytestmark = pytest.mark.float32
+
 
 def test_propositions_agree_with_the_certificate():
     problem = random_problem(5, "wide", strength=1e-6)

@@ -8,6 +8,8 @@ import perfcontrol as pc
 from perfcontrol.theory.stability.safe_step import mean_square_stability, safe_step
 from tests.theory.problems import prediction_problem, random_problem
 
+pytestmark = pytest.mark.float32
+
 
 def test_safe_step_keeps_descent_stable_and_four_thresholds_do_not():
     problem = random_problem(3, bounded=False, strength=0.05)

@@ -12,6 +12,7 @@ from perfcontrol.theory.certificates.paper import Paper
 from perfcontrol.theory.certificates.rigorous import Rigorous
 from perfcontrol.theory.certificates.sharp import Sharp
 from perfcontrol.theory.existence import existence
+from perfcontrol.theory.precision import in_double
 
 SHORTHANDS: dict[str, type[AbstractCertificateKind]] = {
     kind.name: kind for kind in (Paper, Rigorous, GlobalBound, Sharp)
@@ -32,6 +33,7 @@ def as_kind(kind: Any, settings: dict[str, Any] | None = None) -> AbstractCertif
     return SHORTHANDS[kind](**settings)
 
 
+@in_double
 def certify(
     problem: PerformativeProblem, kind: str | AbstractCertificateKind = "sharp", **settings: Any
 ) -> Certificate:

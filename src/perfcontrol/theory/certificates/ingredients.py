@@ -104,13 +104,14 @@ def gather(problem: PerformativeProblem, declared: Declarations | None = None) -
         "perturbation_bound",
         read.perturbation_bound,
         "the almost-sure bound of the perturbations",
-        "scales that know theirs on a bounded set, such as pc.Affine(offset, slope)",
+        "scales that know theirs on a bounded set, such as pc.Affine(offset, slope) or pc.Norm(offset, weight)",
     )
     sensitivity = series(
         "sensitivity",
         read.sensitivity,
         "the sensitivity of the perturbation law",
-        "maps that know theirs, such as pc.Affine(offset, slope); pc.estimate_sensitivity(problem, key=key) samples it",
+        "maps that know theirs, such as pc.Affine(offset, slope) or, on a bounded set, pc.Norm(offset, weight); "
+        "pc.estimate_sensitivity(problem, key=key) samples it",
     )
     return Ingredients(
         horizon=T,

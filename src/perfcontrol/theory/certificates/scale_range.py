@@ -10,7 +10,10 @@ from perfcontrol.problem import PerformativeProblem
 from perfcontrol.theory.facts import in_free_parameters, read
 
 DECLARE = "declare (low, high, Lipschitz constant) over the set by scale_range=(0.0, 1.0, 0.5)"
-GENERAL = f"the scales are a general function: pass scale=pc.Affine(offset, slope) if they are affine, or {DECLARE}"
+GENERAL = (
+    "the scales are a general function: pass scale=pc.Affine(offset, slope) or scale=pc.Norm(offset, weight) if they "
+    f"are affine or go by the norm, or {DECLARE}"
+)
 UNBOUNDED = (
     "the scales are not known to be bounded on this feasible set: pass a bounded one, such as "
     f"feasible_set=pc.FrobeniusBall(1.0), or {DECLARE}"

@@ -18,7 +18,7 @@ from perfcontrol._checks import check_integer, fail
 from perfcontrol.problem import PerformativeProblem, check_end
 from perfcontrol.solvers import InverseStep
 from perfcontrol.solvers.step_sizes import as_step_size
-from perfcontrol.theory.certificates.certify import as_kind
+from perfcontrol.theory.certificates.certify import as_kind, certify
 from perfcontrol.theory.certificates.kind import AbstractCertificateKind
 from perfcontrol.theory.rates.step_size import descent_constants
 
@@ -53,7 +53,7 @@ def rrm_error_bound(
     chosen = as_kind(kind, settings)
     if chosen.name not in ("rigorous", "paper", "global"):
         raise fail("kind", repr(kind), "be 'rigorous', 'paper' or 'global'", "The sharp test is local: no bound.")
-    certificate = chosen.assess(check_end(problem))
+    certificate = certify(check_end(problem), chosen)
     if not certificate.holds:
         raise fail("problem", str(certificate), f"satisfy the {chosen.name} certificate", "No contraction is proved.")
     assert certificate.rate is not None
@@ -101,7 +101,8 @@ def rsgd_error_bound(
     initial_error = _error("initial_error", initial_error)
     m, L, V, _ = descent_constants(problem, kind, **declared)
     rule = as_step_size(step_size)
-    eta = np.array([float(rule(jnp.asarray(n))) for n in range(steps)])
+    values = [np.asarray(rule(jnp.asarray(n))) for n in range(steps)]
+    eta = np.array(values, dtype=float)
     curve = np.empty(steps + 1)
     curve[0] = initial_error
     if form == "recursion":
@@ -118,8 +119,9 @@ def rsgd_error_bound(
     if form != "closed":
         raise fail("form", repr(form), "be 'recursion', 'closed' or 'printed'", "Pass one of these names.")
     limit = min(m / L**2, 1 / m)
-    slow = np.all(eta[:-1] <= eta[1:] * (1 + m * eta[1:] / 2) * (1 + 1e-12)) if steps > 1 else True
-    if steps and (eta.max() > limit * (1 + 1e-12) or not slow):
+    rounding = 1 + max(1e-12, 4 * float(np.finfo(np.result_type(np.float32, *values)).eps))
+    slow = np.all(eta[:-1] <= eta[1:] * (1 + m * eta[1:] / 2) * rounding) if steps > 1 else True
+    if steps and (eta.max() > limit * rounding or not slow):
         raise fail(
             "step_size",
             f"a first step {eta.max():.3g}",

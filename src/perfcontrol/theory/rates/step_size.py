@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 from perfcontrol._checks import fail
 from perfcontrol.problem import PerformativeProblem, check_end
 from perfcontrol.theory.certificates.certificate import Certificate
-from perfcontrol.theory.certificates.certify import as_kind
+from perfcontrol.theory.certificates.certify import as_kind, certify
 from perfcontrol.theory.certificates.kind import AbstractCertificateKind
 
 
@@ -41,7 +41,7 @@ def descent_constants(
     chosen = as_kind(kind, declared)
     if chosen.name not in ("rigorous", "paper"):
         raise fail("kind", repr(kind), "be 'rigorous' or 'paper'", "Only these two come with gradient bounds.")
-    certificate = chosen.assess(problem)
+    certificate = certify(problem, chosen)
     if not certificate.applicable:
         raise fail(
             "problem",

@@ -11,10 +11,12 @@ from perfcontrol.response import respond
 from perfcontrol.response.projected import nearest
 from perfcontrol.theory.existence import set_radius
 from perfcontrol.theory.facts import nearest_to_zero
+from perfcontrol.theory.precision import in_double
 
 DEFAULT_SEED = 11
 
 
+@in_double
 def contraction_estimate(
     problem: PerformativeProblem, *, pairs: int = 16, key: Any = None, center: Any = None
 ) -> float:

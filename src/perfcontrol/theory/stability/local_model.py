@@ -15,6 +15,7 @@ from perfcontrol.evaluate.exact import exact_gradient
 from perfcontrol.evaluate.reaction import reaction_jacobian
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.theory.derivatives import hessian, projection_derivative, range_basis
+from perfcontrol.theory.precision import in_double
 from perfcontrol.theory.stability.mean_square import mean_field_threshold
 
 
@@ -32,6 +33,7 @@ class LocalModel(NamedTuple):
     damping: Callable[[float], np.ndarray] | None
 
 
+@in_double
 def local_model(problem: PerformativeProblem, M: Any) -> LocalModel:
     """The model at a stable policy M (free parameters)."""
     M = np.asarray(M)

@@ -6,6 +6,7 @@ from perfcontrol._checks import fail
 from perfcontrol.problem import PerformativeProblem, check_end
 from perfcontrol.solvers import Result
 from perfcontrol.theory.derivatives import obstacles
+from perfcontrol.theory.precision import in_double
 from perfcontrol.theory.stability.local_model import LocalModel, largest_mean_step, local_model
 from perfcontrol.theory.stability.mean_square import MeanSquareStability, stability_at
 from perfcontrol.theory.stability.stable_policy import find_stable_policy
@@ -31,6 +32,7 @@ def stability_of(
     )
 
 
+@in_double
 def mean_square_stability(
     problem: PerformativeProblem,
     M: Any = None,

@@ -17,6 +17,7 @@ from perfcontrol._programs import program
 from perfcontrol.evaluate.adjoint import mean_path_gradient
 from perfcontrol.evaluate.rollout import lanes
 from perfcontrol.problem import PerformativeProblem
+from perfcontrol.theory.precision import in_double
 
 DENSE_ENTRIES = 20_000_000  # samples × q² that are held at once
 GRADIENTS = 4  # sample gradients for each sampled Jacobian
@@ -127,6 +128,7 @@ class ProbedJacobians:
         images = self._images(X, False)
         return np.einsum("si,ij,sj->s", images, L, images)
 
+    @in_double
     def _images(self, X: np.ndarray, transposed: bool) -> np.ndarray:
         values, vectors = np.linalg.eigh((X + X.T) / 2)
         probes = self.normal @ (vectors * np.sqrt(np.maximum(values, 0))).T
