@@ -51,6 +51,27 @@ def test_stable_point_backs_off_from_unstable_worlds_where_repeated_minimisation
     assert_close(found.M, [[[expected]]], 1e-10)
 
 
+def test_optimum_beyond_an_unstable_belt_is_that_of_a_fine_grid():
+    """C(M; M) = Λ + 2ΛFM + (R + Λ) M²; inside the belt it is infinite."""
+    M = np.linspace(-1.0, 0.5, 300_001)
+    slack = 1 - F**2 - HEIGHT * np.exp(-(((M - CENTRE) / WIDTH) ** 2))
+    Lambda = 1 / np.where(slack > 0, slack, np.nan)
+    costs = Lambda + 2 * Lambda * F * M + (WEIGHT + Lambda) * M**2
+    assert np.any(slack <= 0)
+    found = pc.solve(belt(), pc.PerformativeOptimum(starts=4))
+    assert_close(pc.expected_cost(belt(), found.M), np.nanmin(costs), 1e-9)
+    assert abs(float(found.M[0, 0, 0]) - M[np.nanargmin(costs)]) <= 1e-5
+
+
+@pytest.mark.slow
+def test_optimum_has_no_total_gradient_and_costs_less_than_the_stable_policy():
+    problem = everything()
+    best, stable = (pc.solve(problem, solver).M for solver in (pc.PerformativeOptimum(starts=2), pc.StablePoint()))
+    assert pc.expected_cost(problem, best) < pc.expected_cost(problem, stable)
+    scale = jnp.linalg.norm(pc.expected_gradient(problem, stable, total=True))
+    assert jnp.linalg.norm(pc.expected_gradient(problem, best, total=True)) <= 1e-8 * scale
+
+
 def test_start_in_an_unstable_world_is_named_and_kept():
     problem, wild = everything(), 8 * M
     for solver in (pc.StablePoint(), pc.RRM()):
