@@ -7,7 +7,7 @@ likelihood, which is consistent under any law with these two moments.
 """
 
 import itertools
-from typing import NamedTuple
+from collections.abc import Callable
 
 import numpy as np
 from scipy import optimize
@@ -17,15 +17,7 @@ from perfcontrol.identification.moments import Sums, symmetric_basis, upper
 PATTERNS = 8  # deployments up to which every pattern of signs of a scale is tried
 CROSSING = 9.0  # how much better a scale must fit, in squared standard errors, before it is believed to cross zero
 STEPS = 100
-
-
-class Spread(NamedTuple):
-    """noise (n, n): Σ. scales (k, Q): coefficients by the features of the policy. jacobian (G, P, p): of the local
-    coefficients θ_g by the parameters (upper triangle of Σ, then the scales row by row)."""
-
-    noise: np.ndarray
-    scales: np.ndarray
-    jacobian: np.ndarray
+SETTLED = 1e-8  # of the log-likelihood
 
 
 def variances(totals: Sums, n: int) -> np.ndarray:
@@ -67,36 +59,24 @@ def semidefinite(triangle: np.ndarray, n: int) -> np.ndarray:
     return (vectors * np.maximum(values, 0)) @ vectors.T
 
 
-def scale_fit(totals: Sums, n: int, features: np.ndarray, theta: np.ndarray) -> Spread:
-    """Σ and scales with variance_gk = (scales_k · features_g)², from the free variances `theta` as a start."""
-    noise = n * (n + 1) // 2
-    start = (
-        theta[0, :noise],
-        np.array(
-            [_start(theta[:, noise + k], totals, noise + k, features) for k in range(theta.shape[1] - noise)]
-        ).reshape(-1, features.shape[1]),
-    )
-    parameters = np.concatenate([part.ravel() for part in start])
+def scale_fit(totals: Sums, n: int, features: np.ndarray, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Σ and scales (k, Q), variance_gk = (scales_k · features_g)², from the free variances `theta` as a start."""
+    noise, width = n * (n + 1) // 2, features.shape[1]
+    count = theta.shape[1] - noise
+    start = [_start(theta[:, noise + k], totals, noise + k, features) for k in range(count)]
 
     def local(p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        scales = p[noise:].reshape(-1, features.shape[1])
-        values = features @ scales.T
+        values = features @ p[noise:].reshape(count, width).T
         theta = np.concatenate([np.broadcast_to(p[:noise], (len(features), noise)), values**2], axis=1)
         jacobian = np.zeros((len(features), theta.shape[1], len(p)))
         jacobian[:, :noise, :noise] = np.eye(noise)
-        for k in range(len(scales)):
-            columns = noise + k * features.shape[1] + np.arange(features.shape[1])
+        for k in range(count):
+            columns = noise + k * width + np.arange(width)
             jacobian[:, noise + k, columns] = 2 * values[:, k, None] * features
         return theta, jacobian
 
-    def objective(theta: np.ndarray) -> float:
-        return float(np.einsum("gi,gij,gj->", theta, totals.information, theta) / 2 - np.sum(totals.score * theta))
-
-    parameters = _levenberg(parameters, local, objective, totals)
-    parameters[:noise] = upper(semidefinite(parameters[:noise], n))
-    return Spread(
-        semidefinite(parameters[:noise], n), parameters[noise:].reshape(-1, features.shape[1]), local(parameters)[1]
-    )
+    found = levenberg(np.concatenate([theta[0, :noise], *start]), local, totals)
+    return semidefinite(found[:noise], n), found[noise:].reshape(count, width)
 
 
 def _start(variance: np.ndarray, totals: Sums, index: int, features: np.ndarray) -> np.ndarray:
@@ -117,28 +97,34 @@ def _start(variance: np.ndarray, totals: Sums, index: int, features: np.ndarray)
     return best
 
 
-def _levenberg(parameters: np.ndarray, local, objective, totals: Sums) -> np.ndarray:  # type: ignore[no-untyped-def]
-    """Gauss-Newton steps, damped until they help."""
+def levenberg(parameters: np.ndarray, local: Callable, totals: Sums) -> np.ndarray:
+    """Minimise Σ_g ½ θ_gᵀ I_g θ_g - T_gᵀ θ_g, θ and its jacobian being local(parameters): Gauss-Newton, damped."""
+
+    def objective(theta: np.ndarray) -> float:
+        return float(
+            np.sum(np.einsum("gij,gj->gi", totals.information, theta) * theta) / 2 - np.sum(totals.score * theta)
+        )
+
     damping = 1e-8
     theta, jacobian = local(parameters)
     value = objective(theta)
     for _ in range(STEPS):
-        gradient = np.einsum("gip,gi->p", jacobian, totals.score - np.einsum("gij,gj->gi", totals.information, theta))
-        matrix = np.einsum("gip,gij,gjq->pq", jacobian, totals.information, jacobian)
+        through = totals.information @ jacobian
+        gradient = np.einsum("gip,gi->p", jacobian, totals.score) - np.einsum("gip,gi->p", through, theta)
+        matrix = np.einsum("gip,giq->pq", jacobian, through, optimize=True)
         diagonal = np.maximum(np.diag(matrix), 1e-12 * np.max(np.diag(matrix), initial=1e-300))
         while True:
             step = np.linalg.solve(matrix + damping * np.diag(diagonal), gradient)
-            trial = parameters + step
-            theta_trial, jacobian_trial = local(trial)
+            theta_trial, jacobian_trial = local(parameters + step)
             reached = objective(theta_trial)
             if reached <= value or damping > 1e8:
                 break
             damping *= 10
-        decrement = float(gradient @ step)
         if reached > value:
             break
-        parameters, theta, jacobian, value = trial, theta_trial, jacobian_trial, reached
+        gained = value - reached
+        parameters, theta, jacobian, value = parameters + step, theta_trial, jacobian_trial, reached
         damping = max(damping / 10, 1e-10)
-        if decrement < 1e-10:
+        if float(gradient @ step) < SETTLED and gained < SETTLED:
             break
     return parameters

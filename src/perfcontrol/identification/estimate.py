@@ -5,9 +5,10 @@ from typing import NamedTuple
 import numpy as np
 
 from perfcontrol.identification.blocks import Block
-from perfcontrol.identification.covariance import Spread, scale_fit, variances
+from perfcontrol.identification.covariance import scale_fit, variances
+from perfcontrol.identification.joint import Joint, joint_scoring
 from perfcontrol.identification.location import Location, jacobian, least_squares, reweighted
-from perfcontrol.identification.moments import Sums, covariance_sums, inverse_factors, mean_sums, upper
+from perfcontrol.identification.moments import covariance_sums, covariances, images_of, inverse_factors, mean_sums
 from perfcontrol.identification.transitions import Transitions
 
 ROUNDS = 12
@@ -15,29 +16,33 @@ SETTLED = 1e-7
 
 
 class Moments(NamedTuple):
-    """The estimates and, unit by unit, what they rest on."""
+    """location: of the mean. noise (n, n) and scales (k, Q): of the covariance V (N, n, n)."""
 
     location: Location
-    spread: Spread
-    mean: Block  # the free coefficients of the location, row by row
-    covariance: Block  # upper triangle of Σ, then the scales row by row
-    variances: np.ndarray  # (G, k)
+    noise: np.ndarray
+    scales: np.ndarray
+    V: np.ndarray
+
+    def whiten(self) -> np.ndarray:
+        """L⁻¹, V = L Lᵀ."""
+        return inverse_factors(self.V, float(np.trace(self.noise)) / len(self.noise))
+
+    def residual(self, data: Transitions) -> np.ndarray:
+        """Residuals, enlarged for the degrees of freedom that the mean took."""
+        rows = len(data.y)
+        lost = np.sqrt(rows / max(rows - self.location.identified.shape[1], 1))
+        return self.location.residual(data) * lost
 
 
-def images_of(data: Transitions, directions: np.ndarray) -> np.ndarray:
-    """D_k z for every transition, (N, k, n); z = x, or [x, u] where the directions have n+m columns."""
-    n = data.x.shape[1]
-    z = data.x if directions.shape[-1] == n else np.concatenate([data.x, data.v - data.x @ data.gain.T], axis=1)
-    return np.einsum("kip,tp->tki", directions, z)
+class Estimated(NamedTuple):
+    """Estimates with what every unit contributed: `mean` for the free coefficients of the location, row by row."""
+
+    location: Location
+    mean: Block
+    spread: Joint
 
 
-def covariances(data: Transitions, noise: np.ndarray, variance: np.ndarray, images: np.ndarray) -> np.ndarray:
-    """V for every transition, (N, n, n), for variances (G, k)."""
-    scaled = images * variance[data.row_group][:, :, None]
-    return noise + np.einsum("tki,tkj->tij", scaled, images)
-
-
-def estimate(
+def moments(
     data: Transitions,
     directions: np.ndarray,
     mean_features: np.ndarray,
@@ -45,36 +50,43 @@ def estimate(
     reacting: np.ndarray,
 ) -> Moments:
     """Fit mean and covariance; features are (G, 1 + k), `reacting` (q,) marks the mean coefficients that react."""
-    n, rows = data.y.shape[1], len(data.y)
-    images = images_of(data, directions)
-    J = jacobian(mean_features, reacting)
-    location = least_squares(data, J)
-    lost = rows / max(rows - location.identified.shape[1], 1)  # degrees of freedom
-    residual = location.residual(data) * np.sqrt(lost)
-    noise, variance = residual.T @ residual / rows, np.zeros((len(J), len(directions)))
-    scale = float(np.trace(noise)) / n
-    V = covariances(data, noise, variance, images)
-    rounds = 0
-    while True:
-        whiten = inverse_factors(V, scale)
-        location = reweighted(data, location, whiten)
-        residual = location.residual(data) * np.sqrt(lost)
-        sums = covariance_sums(data, residual, whiten, images)
-        totals = sums.by_group(data.group, len(J))
-        spread = scale_fit(totals, n, scale_features, variances(totals, n))
-        variance = (scale_features @ spread.scales.T) ** 2
-        following = covariances(data, spread.noise, variance, images)
-        settled = np.linalg.norm(following - V) <= SETTLED * np.linalg.norm(V)
-        V, rounds = following, rounds + 1
-        if settled or rounds == ROUNDS:
+    n, images = data.y.shape[1], images_of(data, directions)
+    location = least_squares(data, jacobian(mean_features, reacting))
+    here = Moments(location, np.eye(n), np.zeros((len(directions), scale_features.shape[1])), np.zeros(0))
+    residual = here.residual(data)
+    noise = residual.T @ residual / len(residual)
+    here = here._replace(noise=noise, V=np.broadcast_to(noise, (len(residual), n, n)))
+    for _ in range(ROUNDS):
+        whiten = here.whiten()
+        here = here._replace(location=reweighted(data, here.location, whiten))
+        sums = covariance_sums(data, here.residual(data), whiten, images).by_group(data.group, len(scale_features))
+        noise, scales = scale_fit(sums, n, scale_features, variances(sums, n))
+        V = covariances(data, noise, (scale_features @ scales.T) ** 2, images)
+        moved = np.linalg.norm(V - here.V) / np.linalg.norm(V)
+        here = Moments(here.location, noise, scales, V)
+        if moved <= SETTLED:
             break
-    return Moments(
-        location,
-        spread,
-        _mean_block(data, location, whiten),
-        _covariance_block(data, sums, spread, variance),
-        variance,
-    )
+    return here
+
+
+def estimated(
+    data: Transitions, start: Moments, directions: np.ndarray, scale_features: np.ndarray, free: bool
+) -> Estimated:
+    """The blocks at `start`; free directions are moved with all else to the best fit first."""
+    here, spread = _refined(data, start, directions, scale_features, free)
+    for _ in range(2 * free):
+        here, spread = _refined(data, here, spread.directions, scale_features, free)
+    return Estimated(here.location, _mean_block(data, here.location, here.whiten()), spread)
+
+
+def _refined(
+    data: Transitions, here: Moments, directions: np.ndarray, features: np.ndarray, free: bool
+) -> tuple[Moments, Joint]:
+    """Covariance given the mean, then the mean given the covariance."""
+    spread = joint_scoring(data, here.residual(data), features, (here.noise, here.scales, directions), free)
+    V = covariances(data, spread.noise, (features @ spread.scales.T) ** 2, images_of(data, spread.directions))
+    here = Moments(here.location, spread.noise, spread.scales, V)
+    return here._replace(location=reweighted(data, here.location, here.whiten())), spread
 
 
 def _mean_block(data: Transitions, location: Location, whiten: np.ndarray) -> Block:
@@ -85,16 +97,5 @@ def _mean_block(data: Transitions, location: Location, whiten: np.ndarray) -> Bl
     return Block(
         free.ravel(),
         np.einsum("upi,up->ui", maps, sums.score),
-        np.einsum("upi,upq,uqj->uij", maps, sums.information, maps, optimize=True),
-    )
-
-
-def _covariance_block(data: Transitions, sums: Sums, spread: Spread, variance: np.ndarray) -> Block:
-    noise = upper(spread.noise)
-    theta = np.concatenate([np.broadcast_to(noise, (len(variance), len(noise))), variance], axis=1)[data.group]
-    maps = spread.jacobian[data.group]
-    return Block(
-        np.concatenate([noise, spread.scales.ravel()]),
-        np.einsum("upi,up->ui", maps, sums.score - np.einsum("upq,uq->up", sums.information, theta)),
         np.einsum("upi,upq,uqj->uij", maps, sums.information, maps, optimize=True),
     )

@@ -2,13 +2,16 @@
 
 from typing import Any
 
+import jax
 import numpy as np
 
-from perfcontrol._checks import fail
-from perfcontrol.identification.estimate import covariances, estimate, images_of
+from perfcontrol._checks import check_integer, check_key, fail
+from perfcontrol.identification.directions import estimated_directions
+from perfcontrol.identification.estimate import estimated, moments
 from perfcontrol.identification.features import CONSTANT, Features, features_of
+from perfcontrol.identification.location import jacobian
 from perfcontrol.identification.logs import Logs
-from perfcontrol.identification.moments import covariance_sums, inverse_factors, mean_sums
+from perfcontrol.identification.moments import covariance_sums, images_of, mean_sums
 from perfcontrol.identification.result import Fit
 from perfcontrol.identification.selection import best_mean, best_scale, candidates
 from perfcontrol.identification.transitions import Transitions, transitions_of
@@ -54,15 +57,24 @@ def fit(
         Xing, Gravell, He, Johansson, Summers, arXiv 2002.06613 (covariances, and what of them can be identified).
     """
     data = transitions_of(logs, gain, memory)
-    fixed = _directions(directions, data)
-    mean, scale = _chosen(reaction, data, fixed)
-    return Fit(logs, data, np.asarray(gain, dtype=float), fixed, mean, scale, _moments(data, fixed, mean, scale))
+    asked = _asked(reaction, data)
+    given = None if directions is None else _directions(directions, data)
+    found = given if given is not None else _estimated_directions(data, rank, key)
+    mean, scale = _chosen(asked, data, found)
+    values = mean.values(data.policies), scale.values(data.policies)
+    start = moments(data, found, *values, _reacting(data, found))
+    return Fit(
+        logs,
+        data,
+        np.asarray(gain, dtype=float),
+        mean,
+        scale,
+        estimated(data, start, found, values[1], free=given is None),
+    )
 
 
 def _directions(directions: Any, data: Transitions) -> np.ndarray:
     n, m = data.x.shape[1], data.v.shape[1]
-    if directions is None:
-        raise fail("directions", "None", "be given", "Pass the D_k of Δ = Σ_k σ_k(M) ζ_k D_k, shape (k, n, n).")
     array = np.asarray(directions, dtype=float)
     if array.ndim != 3 or array.shape[1] != n or array.shape[2] not in (n, n + m):
         required = f"have shape (k, n, n) = (k, {n}, {n}), or (k, {n}, {n + m}) to act on [x; u]"
@@ -72,50 +84,62 @@ def _directions(directions: Any, data: Transitions) -> np.ndarray:
     return array
 
 
+def _estimated_directions(data: Transitions, rank: int | None, key: Any) -> np.ndarray:
+    if rank is not None:
+        check_integer("rank", rank, 0)
+    n, m = data.x.shape[1], data.v.shape[1]
+    free = jacobian(_free(data), np.arange(n + m + 1) < n)
+    seed = np.asarray(jax.random.key_data(jax.random.key(0) if key is None else check_key(key))).ravel()
+    return estimated_directions(data, free, rank, seed)
+
+
 def _reacting(data: Transitions, directions: np.ndarray) -> np.ndarray:
     """Which of the mean coefficients on [x, v, 1] may react: those that Δ acts on."""
-    n, m = data.x.shape[1], data.v.shape[1]
-    return np.arange(n + m + 1) < (directions.shape[2] if len(directions) else n)
+    return np.arange(data.x.shape[1] + data.v.shape[1] + 1) < directions.shape[2]
 
 
-def _moments(data: Transitions, directions: np.ndarray, mean: Features, scale: Features) -> Any:
-    values = mean.values(data.policies), scale.values(data.policies)
-    return estimate(data, directions, *values, _reacting(data, directions))
+def _free(data: Transitions) -> np.ndarray:
+    """Features that let every deployment be its own; with many deployments, all candidates together."""
+    count = len(data.policies)
+    if count <= SATURATED:
+        return np.concatenate([np.ones((count, 1)), np.eye(count)[:, 1:]], axis=1)
+    others = [features.values(data.policies)[:, 1:] for features in candidates(data.policies)]
+    return np.concatenate([np.ones((count, 1)), *others], axis=1)
 
 
-def _chosen(reaction: Any, data: Transitions, directions: np.ndarray) -> tuple[Features, Features]:
-    """The features of mean and scale, as asked for or as they predict best."""
+def _asked(reaction: Any, data: Transitions) -> dict[str, Features]:
+    """The features that were asked for; "auto" is left out."""
     asked = reaction if isinstance(reaction, dict) else {"mean": reaction, "scale": reaction}
     unknown = set(asked) - {"mean", "scale"}
     if unknown:
         raise fail("reaction", f"the keys {sorted(asked)}", "have the keys 'mean' and 'scale'", "Leave out the others.")
-    known = {
-        name: features_of("reaction", asked[name], data.policies)
-        for name in asked
-        if not isinstance(asked[name], str) or asked[name] != "auto"
+    return {
+        name: features_of("reaction", what, data.policies)
+        for name, what in asked.items()
+        if not (isinstance(what, str) and what == "auto")
     }
-    missing = {"mean", "scale"} - set(known)
-    if len(data.policies) == 1:
-        known |= dict.fromkeys(missing, CONSTANT)
-    elif missing:
-        known = _selected(data, directions, missing) | known
-    return known["mean"], known["scale"]
+
+
+def _chosen(asked: dict[str, Features], data: Transitions, directions: np.ndarray) -> tuple[Features, Features]:
+    """The features of mean and scale: as asked for, else as they predict best."""
+    missing = {"mean", "scale"} - set(asked)
+    if not len(directions):
+        missing -= {"scale"}
+    chosen = {"scale": CONSTANT, "mean": CONSTANT}
+    if missing and len(data.policies) > 1:
+        chosen |= _selected(data, directions, missing)
+    chosen |= asked
+    return chosen["mean"], chosen["scale"]
 
 
 def _selected(data: Transitions, directions: np.ndarray, wanted: set[str]) -> dict[str, Features]:
-    count, n = len(data.policies), data.y.shape[1]
-    reacting, images = _reacting(data, directions), images_of(data, directions)
-    rich = np.eye(count)
-    if count > SATURATED:
-        rich = np.concatenate([f.values(data.policies)[:, 1:] for f in candidates(data.policies)], axis=1)
-    free = np.concatenate([np.ones((count, 1)), rich[:, 1:]], axis=1)
-    first = estimate(data, directions, free, np.eye(count), reacting)
-    V = covariances(data, first.spread.noise, first.variances, images)
-    whiten = inverse_factors(V, float(np.trace(first.spread.noise)))
+    n, reacting = data.y.shape[1], _reacting(data, directions)
+    first = moments(data, directions, _free(data), np.eye(len(data.policies)), reacting)
+    whiten = first.whiten()
     chosen = {}
     if "mean" in wanted:
         chosen["mean"] = best_mean(mean_sums(data, data.y, whiten), data.group, data.policies, n, reacting)
     if "scale" in wanted:
-        sums = covariance_sums(data, first.location.residual(data), whiten, images)
+        sums = covariance_sums(data, first.residual(data), whiten, images_of(data, directions))
         chosen["scale"] = best_scale(sums, data.group, data.policies, n)
     return chosen

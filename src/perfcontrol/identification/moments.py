@@ -10,6 +10,7 @@ w_{t-1} but not on w_t: so the scores of different units are uncorrelated, whate
 """
 
 import itertools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +21,7 @@ FLOOR = 1e-8  # of the mean squared residual: weights of noise that is singular 
 
 
 class Sums(NamedTuple):
-    """score (U, P) and information (U, P, P) of every unit."""
+    """score (U, P) of every unit; information (U, P, P) likewise, or summed over bins of units."""
 
     score: np.ndarray
     information: np.ndarray
@@ -60,48 +61,95 @@ def inverse_factors(V: np.ndarray, scale: float) -> np.ndarray:
     return np.linalg.inv(np.linalg.cholesky(V + FLOOR * max(scale, np.finfo(float).tiny) * eye))
 
 
-def mean_sums(data: Transitions, residual: np.ndarray, whiten: np.ndarray) -> Sums:
-    """Of the local mean coefficients β (n, q), flattened row by row."""
+def _kronecker_sums(data: Transitions, parts: Callable[[slice], tuple], bins: np.ndarray) -> Sums:
+    """Scores target ⊗ right of every unit; information left ⊗ right rightᵀ summed over bins (U,) of units.
+
+    parts: rows -> left (N, a, a) symmetric, target (N, a), right (N, q); coefficients (a, q), flattened row by row.
+    """
+    score, compact, pairs_a, pairs_q = [], {}, ([], []), ([], [])
+    for units, rows in data.pieces():
+        left, target, right = parts(rows)
+        pairs_a, pairs_q = np.triu_indices(target.shape[1]), np.triu_indices(right.shape[1])
+        left, squares = left[:, *pairs_a], right[:, pairs_q[0]] * right[:, pairs_q[1]]
+        start = data.unit[units.start : units.stop + 1] - rows.start
+        for unit, (first, last) in zip(range(units.start, units.stop), itertools.pairwise(start), strict=True):
+            score.append((target[first:last].T @ right[first:last]).ravel())
+            bin_ = int(bins[unit])
+            compact[bin_] = compact.get(bin_, 0.0) + left[first:last].T @ squares[first:last]
+    a, q = pairs_a[1][-1] + 1, pairs_q[1][-1] + 1
+    full = np.zeros((int(bins.max()) + 1, a, a, q, q))
+    for bin_, sums in compact.items():
+        for i, j, block in zip(*pairs_a, sums, strict=True):
+            full[bin_, i, j][pairs_q] = block
+            full[bin_, i, j].T[pairs_q] = block
+            full[bin_, j, i] = full[bin_, i, j]
+    return Sums(np.array(score), full.transpose(0, 1, 3, 2, 4).reshape(-1, a * q, a * q))
+
+
+def images_of(data: Transitions, directions: np.ndarray) -> np.ndarray:
+    """D_k z for every transition, (N, k, n); z = x, or [x, u] where the directions have n+m columns."""
+    return np.einsum("kip,tp->tki", directions, data.moved(directions.shape[-1]))
+
+
+def covariances(data: Transitions, noise: np.ndarray, variance: np.ndarray, images: np.ndarray) -> np.ndarray:
+    """V for every transition, (N, n, n), for variances (G, k)."""
+    scaled = images * variance[data.row_group][:, :, None]
+    return noise + np.einsum("tki,tkj->tij", scaled, images)
+
+
+def mean_sums(data: Transitions, residual: np.ndarray, whiten: np.ndarray, bins: np.ndarray | None = None) -> Sums:
+    """Of the local mean coefficients β (n, q), flattened row by row; information by unit, or by bins of units."""
     regressors = data.regressors
-    n, q = data.y.shape[1], regressors.shape[1]
-    pairs_n, pairs_q = np.triu_indices(n), np.triu_indices(q)
-    scores, informations = [], []
-    for units, rows in data.pieces():
+
+    def parts(rows: slice) -> tuple:
         W = np.swapaxes(whiten[rows], -1, -2) @ whiten[rows]
-        weighted = np.einsum("tij,tj->ti", W, residual[rows])
-        rho = regressors[rows]
-        left, right = W[:, *pairs_n], rho[:, pairs_q[0]] * rho[:, pairs_q[1]]
-        start = data.unit[units.start : units.stop + 1] - data.unit[units.start]
-        for a, b in itertools.pairwise(start):
-            scores.append((weighted[a:b].T @ rho[a:b]).ravel())
-            informations.append(left[a:b].T @ right[a:b])
-    compact = np.array(informations)
-    full = np.empty((len(compact), n, n, q, q))
-    for k, (i, j) in enumerate(zip(*pairs_n, strict=True)):
-        block = np.empty((len(compact), q, q))
-        block[:, *pairs_q] = compact[:, k]
-        block[:, pairs_q[1], pairs_q[0]] = compact[:, k]
-        full[:, i, j] = full[:, j, i] = block
-    information = full.transpose(0, 1, 3, 2, 4).reshape(-1, n * q, n * q)
-    return Sums(np.array(scores), information)
+        return W, np.einsum("tij,tj->ti", W, residual[rows]), regressors[rows]
+
+    return _kronecker_sums(data, parts, np.arange(len(data.group)) if bins is None else bins)
 
 
-def covariance_sums(data: Transitions, residual: np.ndarray, whiten: np.ndarray, images: np.ndarray) -> Sums:
-    """Of the local covariance coefficients (upper triangle of Σ, θ_1, ..., θ_k), at zero; images: D_k z, (N, k, n)."""
-    n = data.y.shape[1]
-    basis = symmetric_basis(n)
-    scores, informations = [], []
-    for units, rows in data.pieces():
+def operator_sums(data: Transitions, square: np.ndarray, whiten: np.ndarray, z: np.ndarray, bins: np.ndarray) -> Sums:
+    """Of any covariance that is linear in z zᵀ: coefficients (i ≤ j; 1 and z_a z_b, a ≤ b), for squares (N, n, n);
+    information by bins of units."""
+    basis = symmetric_basis(square.shape[-1])
+
+    def parts(rows: slice) -> tuple:
         L = whiten[rows]
-        noise = np.einsum("tia,pab,tjb->tpij", L, basis, L, optimize=True)
-        a = np.einsum("tij,tkj->tki", L, images[rows])
-        design = np.concatenate([isometric(noise), isometric(a[..., :, None] * a[..., None, :])], axis=1)
-        w = np.einsum("tij,tj->ti", L, residual[rows])
-        square = isometric(w[:, :, None] * w[:, None, :])
-        per_row = np.einsum("tps,ts->tp", design, square) / 2
-        start = data.unit[units.start : units.stop + 1] - data.unit[units.start]
-        scores.append(np.add.reduceat(per_row, start[:-1], axis=0))
+        noise = isometric(np.einsum("tia,pab,tjb->tpij", L, basis, L, optimize=True))
+        target = np.einsum("tps,ts->tp", noise, isometric(L @ square[rows] @ np.swapaxes(L, -1, -2))) / 2
+        return noise @ np.swapaxes(noise, -1, -2) / 2, target, monomials(z[rows])
+
+    return _kronecker_sums(data, parts, bins)
+
+
+def monomials(z: np.ndarray) -> np.ndarray:
+    """1 and z_a z_b, a ≤ b, (N, 1 + p(p+1)/2)."""
+    return np.concatenate([np.ones((len(z), 1)), upper(z[:, :, None] * z[:, None, :])], axis=1)
+
+
+def row_sums(data: Transitions, parts: Callable[[slice], tuple[np.ndarray, np.ndarray]], rows: int = 4000) -> Sums:
+    """Of any linear model of whitened squares: rows -> design (N, P, s) and target (N, s), in isometric form."""
+    scores, informations = [], []
+    for units, part in data.pieces(rows):
+        design, target = parts(part)
+        start = data.unit[units.start : units.stop + 1] - part.start
+        scores.append(np.add.reduceat(np.einsum("tps,ts->tp", design, target) / 2, start[:-1], axis=0))
         for first, last in itertools.pairwise(start):
             flat = design[first:last].transpose(0, 2, 1).reshape(-1, design.shape[1])
             informations.append(flat.T @ flat / 2)
     return Sums(np.concatenate(scores), np.array(informations))
+
+
+def covariance_sums(data: Transitions, residual: np.ndarray, whiten: np.ndarray, images: np.ndarray) -> Sums:
+    """Of the local covariance coefficients (upper triangle of Σ, θ_1, ..., θ_k), at zero; images: D_k z, (N, k, n)."""
+    basis = symmetric_basis(data.y.shape[1])
+
+    def parts(rows: slice) -> tuple[np.ndarray, np.ndarray]:
+        L = whiten[rows]
+        noise = np.einsum("tia,pab,tjb->tpij", L, basis, L, optimize=True)
+        a = np.einsum("tij,tkj->tki", L, images[rows])
+        w = np.einsum("tij,tj->ti", L, residual[rows])
+        design = np.concatenate([isometric(noise), isometric(a[..., :, None] * a[..., None, :])], axis=1)
+        return design, isometric(w[:, :, None] * w[:, None, :])
+
+    return row_sums(data, parts)

@@ -18,7 +18,8 @@ from perfcontrol.systems import LinearSystem
 class Coefficients(eqx.Module):
     """Everything that a fitted problem is built from; a leading axis makes a stack.
 
-    A, B, noise mean and covariance; mean (n, p, 1+q) and scale (k, 1+q): coefficients by the features of the policy.
+    A, B, noise mean and covariance; mean (n, p, 1+q) and scale (k, 1+q): coefficients by the features of the policy;
+    directions (k, n, p).
     """
 
     A: Any
@@ -27,37 +28,26 @@ class Coefficients(eqx.Module):
     noise_covariance: Any
     mean: Any
     scale: Any
+    directions: Any
 
 
-def build(
-    c: Coefficients,
-    directions: np.ndarray,
-    mean: Features,
-    scale: Features,
-    *,
-    gain: np.ndarray,
-    law: str,
-    **world: Any,
-) -> PerformativeProblem:
-    """The problem; works under vmap over `c`."""
+def build(c: Coefficients, *, features: tuple[Features, Features], law: str, **world: Any) -> PerformativeProblem:
+    """The problem of coefficients by the features of mean and scale; works under vmap over `c`."""
     c = jax.tree.map(lambda numbers: jnp.asarray(numbers, float), c)
     return PerformativeProblem(
         system=LinearSystem(c.A, c.B),
-        gain=gain if gain.ndim else float(gain),
         noise=Gaussian(c.noise_mean, c.noise_covariance),
-        perturbation=_perturbation(c, directions, mean, scale, law),
+        perturbation=_perturbation(c, *features, law),
         **world,
     )
 
 
-def _perturbation(
-    c: Coefficients, directions: np.ndarray, mean: Features, scale: Features, law: str
-) -> AbstractPerturbation:
+def _perturbation(c: Coefficients, mean: Features, scale: Features, law: str) -> AbstractPerturbation:
     reaction = mean.as_map(c.mean) if c.mean.shape[-1] > 1 else None
-    if len(directions):
-        return DirectionalPerturbation(directions, scale.as_map(c.scale), reaction, law)
+    if len(c.directions):
+        return DirectionalPerturbation(c.directions, scale.as_map(c.scale), reaction, law)
     if reaction is not None:
-        return DirectionalPerturbation(np.zeros((1, *c.mean.shape[:2])), jnp.zeros(1), reaction, law)
+        return DirectionalPerturbation(jnp.zeros((1, *c.mean.shape[:2])), jnp.zeros(1), reaction, law)
     return NoPerturbation()
 
 

@@ -23,15 +23,16 @@ def table(fit: "Fit") -> Any:
     """See `Fit.table`."""
     import xarray
 
-    width = fit.directions.shape[2] if len(fit.directions) else fit.logs.state_size
+    acted = "from_state" if fit.mean_reaction.mean.shape[2] == fit.logs.state_size else "from_both"
     labels = {
         "A": ("state", "from_state"),
         "B": ("state", "input"),
         "noise_mean": ("state",),
         "noise_covariance": ("state", "from_state"),
-        "mean_reaction": ("mean_feature", "state", "from_state" if width == fit.logs.state_size else "from_both"),
+        "mean_reaction": ("mean_feature", "state", acted),
         "scale": ("direction", "scale_coefficient"),
         "deployed_scale": ("deployment", "direction"),
+        "directions": ("direction", "state", acted),
     }
     variables = {name: (("value", *dims), interval(getattr(fit, name))) for name, dims in labels.items()}
     return xarray.Dataset(
@@ -58,7 +59,7 @@ def paragraph(fit: "Fit") -> str:
     said.append(_accuracy("A", fit.A) + " " + _accuracy("B", fit.B))
     spread = np.sqrt(np.diag(np.asarray(fit.noise_covariance.mean)))
     said.append(f"The noise has standard deviations {_numbers(spread)}.")
-    if len(fit.directions):
+    if fit.scale.mean.size:
         scales = interval(fit.deployed_scale)
         parts = [
             f"{abs(low):.3g} to {abs(high):.3g}" if abs(high) - abs(low) > 1e-12 else f"{abs(low):.3g}"

@@ -10,15 +10,14 @@ import numpy as np
 
 from perfcontrol._checks import check_integer, check_key, fail
 from perfcontrol.evaluate import Estimate
-from perfcontrol.identification.covariance import semidefinite
-from perfcontrol.identification.estimate import Moments
+from perfcontrol.identification.estimate import Estimated
 from perfcontrol.identification.features import Features
-from perfcontrol.identification.location import jacobian
 from perfcontrol.identification.logs import Logs
 from perfcontrol.identification.plant import Coefficients, build, logged_start
+from perfcontrol.identification.readings import MeanReading
 from perfcontrol.identification.report import paragraph, table
 from perfcontrol.identification.transitions import Transitions
-from perfcontrol.identification.unidentified import gaps
+from perfcontrol.identification.unidentified import Gap, gaps
 from perfcontrol.problem import PerformativeProblem
 
 
@@ -26,81 +25,69 @@ from perfcontrol.problem import PerformativeProblem
 class Fit:
     """A plant identified from logs. Built by `pc.fit`.
 
-    `A` is the mean of the state matrix at M = 0 (where A + Θ(M) is A), the reaction of the mean is counted from there.
-
-    Attributes:
-        directions: D_k, (k, n, p).
-        mean_features: what the reaction of the mean follows, `.name` in words.
-        scale_features: what the reaction of the scale follows.
+    `A` is the mean of the state matrix at M = 0: the reaction of the mean is counted from there. `mean_features` and
+    `scale_features` say what the reaction follows, in words by `.name`.
     """
 
     logs: Logs
     data: Transitions
     gain: np.ndarray
-    directions: np.ndarray
     mean_features: Features
     scale_features: Features
-    moments: Moments
+    estimated: Estimated
 
     @property
     def A(self) -> Estimate:
         """State matrix, (n, n); the standard error is infinite where the logs do not tell."""
-        n, m = self._sizes
-        at_zero = self._at_zero()
-        return self._estimate(at_zero[:n] + self.data.gain.T @ at_zero[n : n + m])
+        return self._mean.estimate(self._mean.functionals()["A"])
 
     @property
     def B(self) -> Estimate:
         """Input matrix, (n, m); the standard error is infinite where the logs do not tell."""
-        n, m = self._sizes
-        return self._estimate(self._at_zero()[n : n + m])
+        return self._mean.estimate(self._mean.functionals()["B"])
 
     @property
     def noise_mean(self) -> Estimate:
         """E w_t, (n,)."""
-        estimate = self._estimate(self._at_zero()[-1:])
+        estimate = self._mean.estimate(self._mean.functionals()["noise_mean"])
         return Estimate(estimate.mean[:, 0], estimate.standard_error[:, 0])
-
-    @property
-    def noise_covariance(self) -> Estimate:
-        """Cov w_t, (n, n)."""
-        n, _ = self._sizes
-        rows, columns = np.triu_indices(n)
-        errors = np.zeros((n, n))
-        errors[rows, columns] = errors[columns, rows] = self.moments.covariance.standard_errors()[: len(rows)]
-        return Estimate(jnp.asarray(self.moments.spread.noise), jnp.asarray(errors))
-
-    @property
-    def scale(self) -> Estimate:
-        """Coefficients of the scales, (k, 1+q): scale_k(M) = c_k0 + Σ_j c_kj f_j(M). The sign of a row is arbitrary."""
-        scales = self.moments.spread.scales
-        errors = self.moments.covariance.standard_errors()
-        errors = errors[len(errors) - scales.size :]
-        return Estimate(jnp.asarray(scales), jnp.asarray(errors.reshape(scales.shape)))
-
-    @property
-    def deployed_scale(self) -> Estimate:
-        """scale(M) at each deployed policy, (G, k)."""
-        values = self.scale_features.values(self.data.policies)
-        k, q = self.moments.spread.scales.shape
-        covariance = (
-            self.moments.covariance.covariance()[-k * q :, -k * q :].reshape(k, q, k, q) if k else np.zeros(4 * (0,))
-        )
-        variance = np.einsum("gq,kqkr,gr->gk", values, covariance, values) if k else np.zeros((len(values), 0))
-        return Estimate(
-            jnp.asarray(values @ self.moments.spread.scales.T), jnp.asarray(np.sqrt(np.maximum(variance, 0)))
-        )
 
     @property
     def mean_reaction(self) -> Estimate:
         """Coefficients of Θ, (q, n, p): Θ(M) = Σ_j c_j (f_j(M) - f_j(0))."""
-        n, _ = self._sizes
-        width = self.directions.shape[2] if len(self.directions) else n
-        count = self.mean_features.values(np.zeros((1, *self.data.policies.shape[1:]))).shape[1] - 1
-        parts = [self._estimate(self._reaction(j, width)) for j in range(count)]
+        parts = [self._mean.estimate(functional) for functional in self._mean.slopes()]
         if not parts:
-            return Estimate(jnp.zeros((0, n, width)), jnp.zeros((0, n, width)))
+            empty = jnp.zeros((0, self.logs.state_size, self._mean.width))
+            return Estimate(empty, empty)
         return Estimate(jnp.stack([p.mean for p in parts]), jnp.stack([p.standard_error for p in parts]))
+
+    @property
+    def noise_covariance(self) -> Estimate:
+        """Cov w_t, (n, n)."""
+        spread, n = self.estimated.spread, self.logs.state_size
+        errors = np.zeros((n, n))
+        errors[np.triu_indices(n)] = spread.block.standard_errors()[: n * (n + 1) // 2]
+        return Estimate(jnp.asarray(spread.noise), jnp.asarray(np.maximum(errors, errors.T)))
+
+    @property
+    def scale(self) -> Estimate:
+        """Coefficients of the scales, (k, 1+q): scale_k(M) = c_k0 + Σ_j c_kj f_j(M). The sign of a row is arbitrary."""
+        scales = self.estimated.spread.scales
+        variance = np.einsum("kqkq->kq", self.estimated.spread.scale_covariance())
+        return Estimate(jnp.asarray(scales), jnp.asarray(np.sqrt(variance)))
+
+    @property
+    def deployed_scale(self) -> Estimate:
+        """scale(M) at each deployed policy, (G, k)."""
+        spread, values = self.estimated.spread, self.scale_features.values(self.data.policies)
+        variance = np.einsum("gq,kqkr,gr->gk", values, spread.scale_covariance(), values)
+        return Estimate(jnp.asarray(values @ spread.scales.T), jnp.asarray(np.sqrt(np.maximum(variance, 0))))
+
+    @property
+    def directions(self) -> Estimate:
+        """D_k, (k, n, p); the standard error is zero where they were given. The sign of each is arbitrary."""
+        spread = self.estimated.spread
+        return Estimate(jnp.asarray(spread.directions), jnp.asarray(spread.direction_errors()))
 
     @property
     def unidentified(self) -> tuple[str, ...]:
@@ -113,41 +100,6 @@ class Fit:
 
     def __str__(self) -> str:
         return paragraph(self)
-
-    @property
-    def _sizes(self) -> tuple[int, int]:
-        return self.data.x.shape[1], self.data.v.shape[1]
-
-    def _gaps(self) -> Any:
-        return gaps(self.data, self.moments.location, self.mean_features, self.scale_features)
-
-    def _at_zero(self) -> np.ndarray:
-        """The local mean coefficients (q rows) at M = 0 as functionals of the coefficients, (q, p)."""
-        zero = self.mean_features.values(np.zeros((1, *self.data.policies.shape[1:])))
-        n, m = self._sizes
-        width = self.directions.shape[2] if len(self.directions) else n
-        return jacobian(zero, np.arange(n + m + 1) < width)[0]
-
-    def _reaction(self, feature: int, width: int) -> np.ndarray:
-        """Θ's coefficients of one feature as functionals, (width, p); in x and u, not x and v."""
-        n, m = self._sizes
-        first = n + m + 1 + feature * width
-        functional = np.zeros((width, self.moments.location.coefficients.shape[1]))
-        functional[:, first : first + width] = np.eye(width)
-        if width > n:
-            functional[:n] += self.data.gain.T @ functional[n:]
-        return functional
-
-    def _estimate(self, functional: np.ndarray) -> Estimate:
-        """functional (r, p) applied to each row of the coefficients: (n, r)."""
-        location = self.moments.location
-        n, free = location.coefficients.shape[0], location.identified.shape[1]
-        covariance = self.moments.mean.covariance().reshape(n, free, n, free)
-        through = functional @ location.identified
-        variance = np.einsum("ra,iaib,rb->ir", through, covariance, through)
-        hidden = np.abs(functional @ location.unidentified) > 1e-6 * np.linalg.norm(location.unidentified, axis=0)
-        errors = np.where(hidden.any(axis=1), np.inf, np.sqrt(np.maximum(variance, 0)))
-        return Estimate(jnp.asarray(location.coefficients @ functional.T), jnp.asarray(errors))
 
     def problem(
         self,
@@ -172,17 +124,10 @@ class Fit:
         Raises:
             InputError: A or B are not identified (see `unidentified`), or what does not fit the plant.
         """
-        location, spread = self.moments.location, self.moments.spread
-        coefficients = self._coefficients(location.coefficients, spread.noise, spread.scales)
-        return self._build(
-            coefficients,
-            cost=cost,
-            horizon=horizon,
-            feasible_set=feasible_set,
-            initial_state=initial_state,
-            structure=structure,
-            law=law,
-        )
+        spread = self.estimated.spread
+        coefficients = self._coefficients(self.estimated.mean.values, spread.block.values)
+        world = self._world(initial_state) | {"cost": cost, "horizon": horizon, "law": law}
+        return build(coefficients, feasible_set=feasible_set, structure=structure, **world)
 
     def ensemble(
         self,
@@ -199,7 +144,7 @@ class Fit:
         """k fitted plants from resampled episodes, as one stacked problem (a leading axis on every array).
 
         Episodes are drawn with replacement within each deployment, and the estimate takes one scoring step with the
-        weights of the draw. Features and directions stay those of the fit. Use it as
+        weights of the draw. Features, and how many directions there are, stay those of the fit. Use it as
         `jax.vmap(lambda p: pc.solve(p, pc.StablePoint(), throw=False))(ensemble)`.
 
         Args:
@@ -213,30 +158,20 @@ class Fit:
             law: likewise.
         """
         weights = self._weights(check_integer("k", k, 1), check_key(key))
-        n, _ = self._sizes
-        location, noise = self.moments.location, n * (n + 1) // 2
-        free = self.moments.mean.resampled(weights).reshape(k, n, -1)
-        spread = self.moments.covariance.resampled(weights)
-        members = [
-            self._coefficients(
-                location.coefficients + (draw - self.moments.mean.values.reshape(n, -1)) @ location.identified.T,
-                semidefinite(values[:noise], n),
-                values[noise:].reshape(self.moments.spread.scales.shape),
-            )
-            for draw, values in zip(free, spread, strict=True)
-        ]
+        draws = zip(self.estimated.mean.resampled(weights), self.estimated.spread.block.resampled(weights), strict=True)
+        members = [self._coefficients(mean, spread) for mean, spread in draws]
         stacked = jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf, float) for leaf in leaves]), *members)
-        return eqx.filter_vmap(
-            lambda member: self._build(
-                member,
-                cost=cost,
-                horizon=horizon,
-                feasible_set=feasible_set,
-                initial_state=initial_state,
-                structure=structure,
-                law=law,
-            )
-        )(stacked)
+        world = self._world(initial_state) | {"cost": cost, "horizon": horizon, "law": law}
+        return eqx.filter_vmap(lambda c: build(c, feasible_set=feasible_set, structure=structure, **world))(stacked)
+
+    @property
+    def _mean(self) -> MeanReading:
+        zero = self.mean_features.values(np.zeros((1, *self.data.policies.shape[1:])))[0]
+        width = self.estimated.spread.directions.shape[2]
+        return MeanReading(self.estimated.location, self.estimated.mean, self.data.gain, zero, width)
+
+    def _gaps(self) -> list[Gap]:
+        return gaps(self.data, self.estimated, self.mean_features, self.scale_features)
 
     def _weights(self, k: int, key: Any) -> np.ndarray:
         """How often each unit is drawn, (k, U): with replacement, within its deployment."""
@@ -247,22 +182,22 @@ class Fit:
             weights[:, members] = generator.multinomial(len(members), np.full(len(members), 1 / len(members)), size=k)
         return weights
 
-    def _coefficients(self, location: np.ndarray, noise: np.ndarray, scales: np.ndarray) -> Coefficients:
-        n, m = self._sizes
-        local = location @ self._at_zero().T
-        B = local[:, n : n + m]
-        width = self.directions.shape[2] if len(self.directions) else n
-        zero = self.mean_features.values(np.zeros((1, *self.data.policies.shape[1:])))[0, 1:]
-        slopes = [location @ self._reaction(j, width).T for j in range(len(zero))]
-        offset = -sum((f * slope for f, slope in zip(zero, slopes, strict=True)), np.zeros((n, width)))
-        mean = np.stack([offset, *slopes], axis=-1)
-        return Coefficients(local[:, :n] + B @ self.data.gain, B, local[:, -1], noise, mean, scales)
+    def _coefficients(self, mean: np.ndarray, spread: np.ndarray) -> Coefficients:
+        """The numbers of a plant from values of the two blocks."""
+        coefficients = self._mean.coefficients(mean)
+        read = {name: coefficients @ f.T for name, f in self._mean.functionals().items()}
+        noise, scales, directions = self.estimated.spread.at(spread)
+        reaction = self._mean.reaction(coefficients)
+        return Coefficients(read["A"], read["B"], read["noise_mean"][:, 0], noise, reaction, scales, directions)
 
-    def _build(self, c: Coefficients, **world: Any) -> PerformativeProblem:
+    def _world(self, initial_state: Any) -> dict[str, Any]:
+        """What every plant of this fit shares."""
         blocking = [gap.text for gap in self._gaps() if gap.blocks]
         if blocking:
             raise fail("logs", "; ".join(blocking), "identify A and B", "Log episodes that move what stood still.")
-        if world["initial_state"] is None:
-            world["initial_state"] = logged_start(self.logs)
-        features = self.mean_features, self.scale_features
-        return build(c, self.directions, *features, gain=self.gain, memory=self.data.policies.shape[1], **world)
+        return {
+            "features": (self.mean_features, self.scale_features),
+            "gain": self.gain if self.gain.ndim else float(self.gain),
+            "memory": self.data.policies.shape[1],
+            "initial_state": logged_start(self.logs) if initial_state is None else initial_state,
+        }

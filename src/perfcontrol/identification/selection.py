@@ -14,6 +14,7 @@ from perfcontrol.identification.covariance import scale_fit, variances
 from perfcontrol.identification.features import CONSTANT, NORM, SQUARED_NORM, Features, affine
 from perfcontrol.identification.location import jacobian
 from perfcontrol.identification.moments import Sums, upper
+from perfcontrol.identification.operator import least_solution
 
 FOLDS = 5
 MARGIN = 2.0  # log-likelihood that a reaction must gain on unseen data before it is preferred to none
@@ -59,7 +60,7 @@ def best_mean(sums: Sums, group: np.ndarray, policies: np.ndarray, n: int, react
         for train, test in pairs:
             information = np.einsum("gpi,gpq,gqj->ij", maps, train.information, maps, optimize=True)
             score = np.einsum("gpi,gp->i", maps, train.score)
-            total += _score(test, maps @ _least(information, score))
+            total += _score(test, maps @ least_solution(information, score))
         return total
 
     return _best(policies, held_out)
@@ -75,19 +76,12 @@ def best_scale(sums: Sums, group: np.ndarray, policies: np.ndarray, n: int) -> F
         for train, test, free in pairs:
             seen = np.einsum("gii->g", train.information) > 0
             part = Sums(train.score[seen], train.information[seen])
-            spread = scale_fit(part, n, values[seen], free[seen])
-            common = np.broadcast_to(upper(spread.noise), (len(values), noise))
-            total += _score(test, np.concatenate([common, (values @ spread.scales.T) ** 2], axis=1))
+            covariance, scales = scale_fit(part, n, values[seen], free[seen])
+            common = np.broadcast_to(upper(covariance), (len(values), noise))
+            total += _score(test, np.concatenate([common, (values @ scales.T) ** 2], axis=1))
         return total
 
     return _best(policies, held_out)
-
-
-def _least(information: np.ndarray, score: np.ndarray) -> np.ndarray:
-    """The least solution, in columns of unit size, of a singular system."""
-    scale = 1 / np.sqrt(np.maximum(np.diag(information), 1e-300))
-    inverse = np.linalg.pinv(information * scale * scale[:, None], rcond=1e-10, hermitian=True)
-    return scale * (inverse @ (scale * score))
 
 
 def _best(policies: np.ndarray, held_out: Any) -> Features:

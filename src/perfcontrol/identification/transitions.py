@@ -32,6 +32,10 @@ class Transitions(NamedTuple):
         """[x, v, 1], (N, n+m+1)."""
         return np.concatenate([self.x, self.v, np.ones((len(self.x), 1))], axis=1)
 
+    def moved(self, columns: int) -> np.ndarray:
+        """What perturbations with so many columns act on: x, or [x, u]."""
+        return self.x if columns == self.x.shape[1] else np.concatenate([self.x, self.v - self.x @ self.gain.T], axis=1)
+
     @property
     def row_group(self) -> np.ndarray:
         """The deployment of each transition, (N,)."""

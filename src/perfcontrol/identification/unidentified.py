@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from perfcontrol.identification.estimate import Estimated
 from perfcontrol.identification.features import Features
-from perfcontrol.identification.location import Location
 from perfcontrol.identification.transitions import Transitions
 
 
@@ -16,8 +16,9 @@ class Gap(NamedTuple):
     blocks: bool
 
 
-def gaps(data: Transitions, location: Location, mean: Features, scale: Features) -> list[Gap]:
+def gaps(data: Transitions, estimated: Estimated, mean: Features, scale: Features) -> list[Gap]:
     """Everything that these logs cannot tell, the gravest first."""
+    location = estimated.location
     n, m = data.x.shape[1], data.v.shape[1]
     found = []
     for direction in _directions(location.unidentified[n : n + m]):
@@ -31,6 +32,9 @@ def gaps(data: Transitions, location: Location, mean: Features, scale: Features)
     for direction in _directions(location.unidentified[:n]):
         text = f"A along the state direction {_shown(direction)}: the state does not move there"
         found.append(Gap(text + " by itself (start episodes elsewhere)", True))
+    if estimated.spread.tangent.shape[-1]:
+        text = "the law of the perturbations beyond their second moments: other directions may give the same ones"
+        found.append(Gap(text + " (expected costs do not tell them apart)", False))
     policies = data.policies.reshape(len(data.policies), -1)
     if len(policies) == 1:
         found.append(Gap("any reaction: only one policy was deployed (deploy a second)", False))
