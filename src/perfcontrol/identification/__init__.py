@@ -2,6 +2,7 @@
 
 from perfcontrol.identification.identify import fit
 from perfcontrol.identification.logs import Logs
+from perfcontrol.identification.reaction_test import ReactionTest, test_reaction
 from perfcontrol.identification.result import Fit
 
-__all__ = ["Fit", "Logs", "fit"]
+__all__ = ["Fit", "Logs", "ReactionTest", "fit", "test_reaction"]

@@ -58,7 +58,7 @@ def fit(
     """
     data = transitions_of(logs, gain, memory)
     asked = _asked(reaction, data)
-    given = None if directions is None else _directions(directions, data)
+    given = None if directions is None else check_directions(directions, data)
     found = given if given is not None else _estimated_directions(data, rank, key)
     mean, scale = _chosen(asked, data, found)
     values = mean.values(data.policies), scale.values(data.policies)
@@ -73,7 +73,8 @@ def fit(
     )
 
 
-def _directions(directions: Any, data: Transitions) -> np.ndarray:
+def check_directions(directions: Any, data: Transitions) -> np.ndarray:
+    """Directions that the user gave."""
     n, m = data.x.shape[1], data.v.shape[1]
     array = np.asarray(directions, dtype=float)
     if array.ndim != 3 or array.shape[1] != n or array.shape[2] not in (n, n + m):

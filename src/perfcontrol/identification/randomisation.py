@@ -11,6 +11,8 @@ deployment); no finite number makes it exact.
 
 import numpy as np
 
+from perfcontrol.identification.deviations import centred
+
 CHUNK = 2**22  # numbers held at a time
 
 
@@ -19,9 +21,7 @@ def quadratic_statistics(contributions: np.ndarray, group: np.ndarray, signs: np
     units, groups, count = contributions.shape
     flat = contributions.reshape(units, -1)
     members = [np.flatnonzero(group == h) for h in np.unique(group)]
-    residual = np.empty_like(flat)
-    for rows in members:
-        residual[rows] = (flat[rows] - flat[rows].mean(axis=0)) * np.sqrt(len(rows) / max(len(rows) - 1, 1))
+    residual = centred(contributions, group)
     square = np.sum(residual**2, axis=0)
     negligible = square <= 1e-20 * np.sum(flat**2, axis=0).max(initial=0.0)  # rounding
     observed = _ratio(flat.sum(axis=0) ** 2, square, negligible)
@@ -30,13 +30,13 @@ def quadratic_statistics(contributions: np.ndarray, group: np.ndarray, signs: np
     step = max(1, CHUNK // max(flat.shape[1], 1))
     for first in range(0, len(signs), step):
         part = signs[first : first + step]
-        total, lost = np.zeros((len(part), flat.shape[1])), np.zeros((len(part), flat.shape[1]))
+        total = np.zeros((len(part), flat.shape[1]))
         variance = np.zeros_like(total)
         for rows in members:
             own = part[:, rows] @ residual[rows]
             total += own
-            lost = own**2 / len(rows)
-            variance += (np.sum(residual[rows] ** 2, axis=0) - lost) * len(rows) / max(len(rows) - 1, 1)
+            about_mean = np.sum(residual[rows] ** 2, axis=0) - own**2 / len(rows)
+            variance += about_mean * len(rows) / max(len(rows) - 1, 1)
         flipped = _ratio(total**2, variance, negligible)
         out[1 + first : 1 + first + len(part)] = flipped.reshape(-1, groups, count).sum(axis=1)
     return out

@@ -6,6 +6,7 @@ import numpy as np
 
 from perfcontrol.identification.estimate import Estimated
 from perfcontrol.identification.features import Features
+from perfcontrol.identification.location import Location
 from perfcontrol.identification.transitions import Transitions
 
 
@@ -16,22 +17,22 @@ class Gap(NamedTuple):
     blocks: bool
 
 
-def gaps(data: Transitions, estimated: Estimated, mean: Features, scale: Features) -> list[Gap]:
-    """Everything that these logs cannot tell, the gravest first."""
-    location = estimated.location
+def untold(data: Transitions, location: Location) -> list[Gap]:
+    """What of A and B the states and inputs of these logs cannot tell."""
     n, m = data.x.shape[1], data.v.shape[1]
     found = []
     for direction in _directions(location.unidentified[n : n + m]):
-        found.append(
-            Gap(
-                f"B along the input direction {_shown(direction)}: u + K x never moves there, so that only A - B K is "
-                "known (deploy a policy that acts there)",
-                True,
-            )
-        )
+        text = f"B along the input direction {_shown(direction)}: u + K x never moves there, so that only A - B K is"
+        found.append(Gap(text + " known (deploy a policy that acts there)", True))
     for direction in _directions(location.unidentified[:n]):
         text = f"A along the state direction {_shown(direction)}: the state does not move there"
         found.append(Gap(text + " by itself (start episodes elsewhere)", True))
+    return found
+
+
+def gaps(data: Transitions, estimated: Estimated, mean: Features, scale: Features) -> list[Gap]:
+    """Everything that these logs cannot tell, the gravest first."""
+    found = untold(data, estimated.location)
     if estimated.spread.tangent.shape[-1]:
         text = "the law of the perturbations beyond their second moments: other directions may give the same ones"
         found.append(Gap(text + " (expected costs do not tell them apart)", False))

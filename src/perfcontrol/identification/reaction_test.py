@@ -1,0 +1,218 @@
+"""Does the plant react? A test of one law for all deployments, the sizes of what differs, what to deploy next."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from perfcontrol._checks import check_integer, check_key, fail
+from perfcontrol.evaluate import Estimate
+from perfcontrol.identification.common import Common, common_fit
+from perfcontrol.identification.deviations import centred, estimated_deviations, score_deviations
+from perfcontrol.identification.identify import check_directions
+from perfcontrol.identification.logs import Logs
+from perfcontrol.identification.next_policy import next_policy
+from perfcontrol.identification.randomisation import combined, p_values, quadratic_statistics
+from perfcontrol.identification.transitions import Transitions, transitions_of
+from perfcontrol.identification.unidentified import untold
+
+NORMAL = 1.959963984540054
+FEW = 8  # episodes (or blocks) of a deployment below which the test's approximation is poor
+ALIKE = 0.05  # distance of policies, relative to their norms, below which they are hardly two
+
+
+@dataclass(frozen=True, eq=False)
+class Effect:
+    """How much one part differs between deployments: root mean square, with a 95 % interval, and its own p-value.
+
+    by_deployment: each deployment against the others; (G, n, n) for the mean (the change of A), else (G,).
+    """
+
+    size: float
+    low: float
+    high: float
+    p_value: float
+    by_deployment: Estimate
+
+
+@dataclass(frozen=True, eq=False)
+class ReactionTest:
+    """What `pc.test_reaction` found.
+
+    p_value: of the hypothesis that nothing reacts; None where the logs cannot tell.
+    effect: "mean" (shift of the predicted next state at a typical state, in standard deviations of its error),
+        "perturbation" and "noise" (change of their share in the variance of that error); empty where it cannot be told.
+    next_policy: (memory, m, n), what to deploy next to learn most. missing: what cannot be told, in words.
+    """
+
+    p_value: float | None
+    effect: dict[str, Effect]
+    next_policy: np.ndarray
+    missing: tuple[str, ...]
+
+    def __str__(self) -> str:
+        said = []
+        if self.p_value is None:
+            said.append("These logs cannot tell whether the plant reacts.")
+        else:
+            verdict = "The plant reacts" if self.p_value <= 0.05 else "No reaction is seen"
+            said.append(f"{verdict} (p = {self.p_value:.3g}).")
+        units = {
+            "mean": "standard deviations",
+            "perturbation": "of the error variance",
+            "noise": "of the error variance",
+        }
+        for name, effect in self.effect.items():
+            interval = f"{effect.low:.2g} to {effect.high:.2g}"
+            said.append(f"{name.capitalize()}: {effect.size:.2g} {units[name]} ({interval}; p = {effect.p_value:.3g}).")
+        if self.missing:
+            said.append("Cannot be told: " + "; ".join(self.missing) + ".")
+        rows = "; ".join(" ".join(f"{x:.3g}" for x in row) for lag in self.next_policy for row in lag)
+        said.append(f"Most is learned by deploying next [{rows}].")
+        return " ".join(said)
+
+
+def test_reaction(
+    logs: Logs,
+    gain: Any = 0,
+    memory: int | None = None,
+    permutations: int = 999,
+    key: Any = None,
+    *,
+    directions: Any = None,
+    candidates: Any = None,
+    radius: float | None = None,
+) -> ReactionTest:
+    """Test whether mean dynamics, perturbation covariance or noise differ between the deployments of some logs.
+
+    Null: A, B and the laws of Δ and w are the same under every policy. Paths are not exchangeable under it, since the
+    inputs follow the policy; so the test is on scores at a common fit, which have mean zero under every policy, freed
+    of the error of that fit. Each episode's scores change sign at random, `permutations` times. The largest and the
+    summed squares over deployments of mean coefficients, of the size of perturbations and noise, and of the entries of
+    their covariances are compared with themselves under these flips; one p-value is made of the smallest.
+
+    The level is asymptotic in the number of episodes of each deployment; it does not ask for Gaussian, equal or
+    symmetric laws. How it does in finite samples is measured in the documentation. Fewer than 40 episodes in all are
+    cut into blocks.
+
+    Args:
+        logs, gain, memory: as in `fit`.
+        permutations: random changes of signs; the smallest possible p-value is 1 / (permutations + 1).
+        key: JAX random key.
+        directions: (k, n, n) of the perturbations if they are known: more power. None looks at any covariance.
+        candidates: policies to choose the next one from; None looks within `radius` of the last one deployed.
+        radius: Frobenius norm; None takes the largest distance between deployed policies.
+
+    Returns:
+        A `ReactionTest`; str() is a paragraph.
+
+    Raises:
+        InputError: logs, gain, memory or candidates that do not fit one another; no key.
+    """
+    data = transitions_of(logs, gain, memory)
+    check_integer("permutations", permutations, 1)
+    generator = np.random.default_rng(np.asarray(jax.random.key_data(check_key(key))).ravel())
+    known = None if directions is None else check_directions(directions, data)
+    if known is not None and known.shape[2] != data.x.shape[1]:
+        raise fail("directions", f"{known.shape}", "act on the state alone", "Leave them out.")
+    common = common_fit(data, known)
+    chosen = next_policy(data, common, candidates, radius, generator)
+    missing = _missing(data, common)
+    if len(data.policies) == 1:
+        return ReactionTest(None, {}, chosen, missing)
+    signs = generator.choice([-1.0, 1.0], (permutations, len(data.group)))
+    effects, statistics = _tested(data, common, signs)
+    return ReactionTest(combined(statistics), effects, chosen, missing)
+
+
+def _tested(data: Transitions, common: Common, signs: np.ndarray) -> tuple[dict[str, Effect], np.ndarray]:
+    """The effects, and all statistics (P+1, K)."""
+    group = data.group
+
+    def drawn(contributions: np.ndarray) -> np.ndarray:
+        return quadratic_statistics(contributions, group, signs)
+
+    whole, states, root = _mean_coordinates(data, common)
+    mean = drawn(score_deviations(common.mean, group, whole))
+    shift = estimated_deviations(common.mean, group, states)
+
+    sizes = np.stack([common.perturbation, common.noise], axis=1) / _shares(data, common)
+    share = estimated_deviations(common.covariance, group, sizes)
+    both = score_deviations(common.covariance, group, sizes.sum(axis=1, keepdims=True))
+    size = drawn(np.concatenate([share, both], axis=2))
+    scale = 1 / np.sqrt(np.maximum(np.einsum("gpp->p", common.covariance.information), 1e-300))
+    entries = drawn(score_deviations(common.covariance, group, np.diag(scale)))
+    noisy = common.noise_entries
+    of_mean = np.stack([mean.max(axis=1), mean.sum(axis=1)], axis=1)
+    of_entries = np.stack([entries[:, ~noisy].sum(axis=1), entries[:, noisy].sum(axis=1)], axis=1)
+    statistics = np.concatenate([of_mean, size.max(axis=1, keepdims=True), of_entries], axis=1)
+    n = data.x.shape[1]
+    natural = common.root @ shift.reshape(*shift.shape[:2], n, -1) @ root.T
+    effects = {
+        "mean": _effect(shift, natural, group, combined(of_mean), n),
+        "perturbation": _effect(share[..., :1], share[..., 0], group, float(p_values(size[:, :1])[0, 0]), 1),
+        "noise": _effect(share[..., 1:], share[..., 1], group, float(p_values(size[:, 1:2])[0, 0]), 1),
+    }
+    return effects, statistics
+
+
+def _mean_coordinates(data: Transitions, common: Common) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Functionals of the mean coefficients in units of the error: all of them, those of the state; S^{-1/2} for x."""
+    n, m = data.x.shape[1], data.v.shape[1]
+    root, inputs = _inverse_root(data.x), _inverse_root(data.v)
+    columns = np.zeros((n + m + 1, root.shape[1] + inputs.shape[1] + 1))
+    columns[:n, : root.shape[1]] = root
+    columns[n : n + m, root.shape[1] : -1] = inputs
+    columns[-1, -1] = 1
+    return np.kron(common.root, columns), np.kron(common.root, columns[:, : root.shape[1]]), root
+
+
+def _inverse_root(z: np.ndarray) -> np.ndarray:
+    """W (p, r) with z W of unit second moment, r the directions in which z moves."""
+    values, vectors = np.linalg.eigh(z.T @ z / len(z))
+    kept = values > 1e-12 * values.max(initial=0.0)
+    return vectors[:, kept] / np.sqrt(values[kept])
+
+
+def _shares(data: Transitions, common: Common) -> np.ndarray:
+    """Average of tr(V⁻¹ 𝒞) / n for perturbations and noise as fitted, (2,): to count their changes in such shares."""
+    information = common.covariance.information.sum(axis=0)
+    whole = common.perturbation + common.noise
+    parts = np.array([common.perturbation @ information @ whole, common.noise @ information @ whole])
+    return np.maximum(np.abs(2 * parts / len(data.y) / data.x.shape[1]), 1e-12)
+
+
+def _effect(values: np.ndarray, shown: np.ndarray, group: np.ndarray, p: float, n: int) -> Effect:
+    """From contributions (U, G, J) in units of the error, and those to be shown."""
+    total, residual = values.sum(axis=0).ravel(), centred(values, group)
+    count = values.shape[1] * n
+    bias, spread = float(np.sum(residual**2)), residual @ total
+    square = (float(total @ total) - bias) / count
+    error = np.sqrt(4 * float(spread @ spread) + 2 * float(np.sum((residual @ residual.T) ** 2))) / count
+    low, size, high = (float(np.sqrt(max(square + d, 0.0))) for d in (-NORMAL * error, 0.0, NORMAL * error))
+    deviation = np.sqrt(np.sum(centred(shown, group) ** 2, axis=0)).reshape(shown.shape[1:])
+    return Effect(size, low, high, p, Estimate(jnp.asarray(shown.sum(axis=0)), jnp.asarray(deviation)))
+
+
+def _missing(data: Transitions, common: Common) -> tuple[str, ...]:
+    policies = data.policies.reshape(len(data.policies), -1)
+    found = [gap.text for gap in untold(data, common.location)]
+    if len(policies) == 1:
+        return (*found, "any reaction: only one policy was deployed (deploy a second)")
+    distance = np.linalg.norm(policies[:, None] - policies[None], axis=2).max()
+    size = np.linalg.norm(policies, axis=1).max()
+    if distance <= ALIKE * size:
+        found.append(
+            f"a reaction to larger changes: the policies differ by {distance / size:.2g} of their norm at most"
+        )
+    counts = np.bincount(data.group)
+    for g in np.flatnonzero(counts < FEW):
+        found.append(f"anything finer of policy {g}: {counts[g]} episodes are few for the approximation of the test")
+    tried = int(np.linalg.matrix_rank(policies - policies[0], tol=1e-9 * size))
+    if tried < policies.shape[1]:
+        found.append(
+            f"a reaction to {policies.shape[1] - tried} of {policies.shape[1]} directions of the policy: never tried"
+        )
+    return tuple(found)
