@@ -65,7 +65,7 @@ def sections(docstring):
     return kinds["parameters"], kinds["attributes"]
 
 
-MACHINERY = {"Fit": ("logs", "data", "gain", "moments")}  # fields that are none of the user's business
+MACHINERY = {"Fit": ("logs", "data", "gain", "estimated")}  # fields that are none of the user's business
 
 
 def called_by_users(value):

@@ -238,6 +238,7 @@ WRONG = {
         "numbers": (lambda: pc.Logs(1, 2, 3), "x", "(episode, time, state)"),
         "states not a number": (lambda: pc.Logs(DATA[0] * nan, *DATA[1:]), "x", "nan"),
         "no logs": (lambda: pc.fit(None), "logs", "pc.Logs(x, u, deployed)"),
+        "no logs to test": (lambda: pc.test_reaction(None), "logs", "pc.Logs(x, u, deployed)"),
         "folder as a number": (lambda: pc.cache(3), "path", "folder"),
         "unknown order": (lambda: pc.experiments.stock_market("up"), "order", "'up'"),
         "unknown set": (lambda: pc.experiments.stock_market(feasible_set="box"), "feasible_set", "'box'"),
@@ -254,7 +255,16 @@ def test_wrong_value_is_refused_by_the_name_of_its_argument_with_a_remedy(case):
 
 
 # What the package gives back, and what takes no value that could be wrong.
-GIVEN_BACK = {"Certificate", "ConfidenceRegion", "Estimate", "Fit", "Solution", "StateMoments", "Trajectories"}
+GIVEN_BACK = {
+    "Certificate",
+    "ConfidenceRegion",
+    "Estimate",
+    "Fit",
+    "ReactionTest",
+    "Solution",
+    "StateMoments",
+    "Trajectories",
+}
 
 
 def test_every_public_name_that_takes_values_has_a_row():

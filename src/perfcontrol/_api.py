@@ -27,7 +27,7 @@ from perfcontrol.evaluate import (
     simulate,
     state_moments,
 )
-from perfcontrol.identification import Fit, Logs, fit
+from perfcontrol.identification import Fit, Logs, ReactionTest, fit, test_reaction
 from perfcontrol.perturbations import (
     AbstractPerturbation,
     DensePerturbation,
@@ -162,6 +162,7 @@ __all__ = [
     "PowerStep",
     "QuadraticCost",
     "Rademacher",
+    "ReactionTest",
     "RepeatedBlock",
     "Result",
     "Rigorous",
@@ -208,6 +209,7 @@ __all__ = [
     "solve",
     "state_moments",
     "strong_stability",
+    "test_reaction",
     "theorem_step_size",
 ]
 

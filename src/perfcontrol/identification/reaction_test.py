@@ -41,10 +41,13 @@ class Effect:
 class ReactionTest:
     """What `pc.test_reaction` found.
 
-    p_value: of the hypothesis that nothing reacts; None where the logs cannot tell.
-    effect: "mean" (shift of the predicted next state at a typical state, in standard deviations of its error),
-        "perturbation" and "noise" (change of their share in the variance of that error); empty where it cannot be told.
-    next_policy: (memory, m, n), what to deploy next to learn most. missing: what cannot be told, in words.
+    Attributes:
+        p_value: of the hypothesis that nothing reacts; None where the logs cannot tell.
+        effect: sizes by name: "mean" (shift of the predicted next state at a typical state, in standard deviations of
+            its error), "perturbation" and "noise" (change of their share in the variance of that error), each with
+            `.size .low .high .p_value .by_deployment`; empty where it cannot be told.
+        next_policy: (memory, m, n), what to deploy next to learn most.
+        missing: what cannot be told, in words.
     """
 
     p_value: float | None
@@ -88,17 +91,21 @@ def test_reaction(
     """Test whether mean dynamics, perturbation covariance or noise differ between the deployments of some logs.
 
     Null: A, B and the laws of Δ and w are the same under every policy. Paths are not exchangeable under it, since the
-    inputs follow the policy; so the test is on scores at a common fit, which have mean zero under every policy, freed
-    of the error of that fit. Each episode's scores change sign at random, `permutations` times. The largest and the
-    summed squares over deployments of mean coefficients, of the size of perturbations and noise, and of the entries of
-    their covariances are compared with themselves under these flips; one p-value is made of the smallest.
+    inputs follow the policy; so labels are not permuted. Each episode contributes a score at a common fit, freed of the
+    error of that fit, which has mean zero under every policy; it changes its sign at random, `permutations` times. The
+    largest and the summed squares over deployments of mean coefficients, of the size of perturbations and noise, and of
+    the entries of their covariances are compared with themselves under these flips; one p-value is made of the least.
 
-    The level is asymptotic in the number of episodes of each deployment; it does not ask for Gaussian, equal or
-    symmetric laws. How it does in finite samples is measured in the documentation. Fewer than 40 episodes in all are
-    cut into blocks.
+    Exact: given the flips, the p-value accounts for the choice among the statistics and for the number of flips.
+    Asymptotic, in the number of episodes of each deployment: that flipped scores have the law of the observed ones, and
+    that the common fit is near enough for its error to be freed to first order. No law need be Gaussian, symmetric or
+    equal in different deployments; fourth moments of the residuals must exist. Fewer than 40 episodes in all are cut
+    into blocks, whose scores are uncorrelated but not independent. The documentation has levels as measured.
 
     Args:
-        logs, gain, memory: as in `fit`.
+        logs: episodes under two or more policies.
+        gain: as in `fit`.
+        memory: as in `fit`.
         permutations: random changes of signs; the smallest possible p-value is 1 / (permutations + 1).
         key: JAX random key.
         directions: (k, n, n) of the perturbations if they are known: more power. None looks at any covariance.

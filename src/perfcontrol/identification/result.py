@@ -25,8 +25,11 @@ from perfcontrol.problem import PerformativeProblem
 class Fit:
     """A plant identified from logs. Built by `pc.fit`.
 
-    `A` is the mean of the state matrix at M = 0: the reaction of the mean is counted from there. `mean_features` and
-    `scale_features` say what the reaction follows, in words by `.name`.
+    `A` is the mean of the state matrix at M = 0: the reaction of the mean is counted from there.
+
+    Attributes:
+        mean_features: what the reaction of the mean follows, `.name` in words.
+        scale_features: what the reaction of the scales follows.
     """
 
     logs: Logs
