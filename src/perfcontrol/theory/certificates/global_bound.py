@@ -17,7 +17,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 import scipy.linalg
-import scipy.optimize
 
 from perfcontrol.perturbations import DirectionalPerturbation
 from perfcontrol.problem import PerformativeProblem
@@ -114,6 +113,8 @@ def largest_on_sublevel(L: np.ndarray, G: np.ndarray, level: float) -> float:
     Args:
         L, G: (1+q, 1+q), positive semidefinite, the y-block of G definite. level: at least the minimum of the form G.
     """
+    from scipy.optimize import minimize_scalar  # here alone: its import takes 0.2 s
+
     factor = np.linalg.cholesky(G[1:, 1:])
     centre = -scipy.linalg.cho_solve((factor, True), G[1:, 0])
     slack = max(level - float(G[0, 0] + G[1:, 0] @ centre), 0.0)
@@ -131,5 +132,5 @@ def largest_on_sublevel(L: np.ndarray, G: np.ndarray, level: float) -> float:
         return constant + tau * slack + float(np.sum(weights / (tau - values)))
 
     scale = np.log(max(top, np.sqrt(weights.sum() / max(slack, 1e-300)), 1e-300))
-    found = scipy.optimize.minimize_scalar(dual, bounds=(scale - 30, scale + 10), method="bounded")
+    found = minimize_scalar(dual, bounds=(scale - 30, scale + 10), method="bounded")
     return min(dual(float(found.x)), dual(scale), dual(scale - 30))  # type: ignore[attr-defined]
