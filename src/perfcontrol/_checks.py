@@ -225,7 +225,7 @@ def check_positive_tolerance(tolerance: Any) -> float | None:
     """A relative tolerance, or None for the default of the precision that will be used."""
     if tolerance is not None and not (isinstance(tolerance, int | float | np.floating) and 0 < tolerance < np.inf):
         raise fail("tolerance", repr(tolerance), "be a positive number", "Pass None for the default.")
-    return tolerance
+    return None if tolerance is None else float(tolerance)
 
 
 def check_tolerance(tolerance: float | None, dtype: Any) -> float:

@@ -1,6 +1,7 @@
 """Theory works in double precision, whatever the precision of the problem: a proof has no room for rounding in 1e-7."""
 
 import functools
+import importlib
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from typing import Any, ParamSpec, TypeVar
@@ -17,9 +18,8 @@ def double_precision() -> AbstractContextManager[Any]:
     """Where JAX knows float64, on this thread only; what the user has set stays as it is."""
     if hasattr(jax, "enable_x64"):
         return jax.enable_x64(True)
-    from jax.experimental import enable_x64  # its place before JAX 0.8
-
-    return enable_x64()
+    # its place before JAX 0.8
+    return importlib.import_module("jax.experimental").enable_x64()
 
 
 def _is_short(leaf: Any) -> bool:
