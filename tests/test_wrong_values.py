@@ -232,6 +232,12 @@ WRONG = {
         "unknown method": (lambda: pc.estimate_sensitivity(problem, method="magic"), "method", "'magic'"),
         "negative distance": (lambda: pc.rrm_error_bound(problem, -1.0, 5), "initial_error", "distance"),
         "half a step": (lambda: pc.rsgd_error_bound(problem, 0.1, 1.0, 2.5), "steps", "integer"),
+        "price from no start": (lambda: pc.price_of_stability(problem, starts=0), "starts", "at least 1"),
+        "policy before of another shape": (
+            lambda: pc.price_of_stability(problem, deployed_before=np.zeros((2, 2))),
+            "deployed_before",
+            "M[None]",
+        ),
         "step of no kind": (lambda: pc.theorem_step_size(problem, kind="best"), "kind", "'best'"),
     },
     "data": {
@@ -260,6 +266,7 @@ GIVEN_BACK = {
     "ConfidenceRegion",
     "Estimate",
     "Fit",
+    "PriceOfStability",
     "ReactionTest",
     "Solution",
     "StateMoments",

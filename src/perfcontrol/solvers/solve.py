@@ -61,13 +61,8 @@ def solve(
     M0 = problem.initial_policy() if M0 is None else problem.check_policy("M0", M0)
     leaves = jax.tree.leaves(eqx.filter((problem, solver, M0, key), eqx.is_array))
     concrete = all(is_concrete(leaf) for leaf in leaves)
-    if concrete and not bool(problem.feasible_set.contains(M0, _slack(M0))):
-        raise fail(
-            "M0",
-            f"a policy {float(jnp.linalg.norm(M0 - problem.feasible_set.project(M0))):.3g} away",
-            "lie in the feasible set",
-            "Pass problem.feasible_set.project(M0), or leave M0 out.",
-        )
+    if concrete:
+        check_feasible("M0", problem, M0)
     warn_of_unstable_gain(problem)
     run = Run(problem, solver, M0, key, total, identity if record is None else record, every, progress)
     stopped = max_steps is not None and max_steps < solver.max_steps
@@ -83,6 +78,17 @@ def solve(
     if throw and solution.result != Result.success:
         raise SolveError(f"{Result[solution.result]} (step {int(solution.steps)})", solution)
     return solution
+
+
+def check_feasible(name: str, problem: PerformativeProblem, M: Array) -> None:
+    """Raise unless a known policy lies in the feasible set."""
+    if not bool(problem.feasible_set.contains(M, _slack(M))):
+        raise fail(
+            name,
+            f"a policy {float(jnp.linalg.norm(M - problem.feasible_set.project(M))):.3g} away",
+            "lie in the feasible set",
+            f"Pass problem.feasible_set.project({name}), or leave {name} out.",
+        )
 
 
 def _finished(run: Run, stopped: bool) -> Solution:

@@ -16,6 +16,7 @@ from perfcontrol.theory.certificates.rigorous import Rigorous
 from perfcontrol.theory.certificates.sharp import Sharp
 from perfcontrol.theory.derivatives import hessian
 from perfcontrol.theory.existence import Existence, existence
+from perfcontrol.theory.price import PriceOfStability, price_of_stability
 from perfcontrol.theory.rates.error_bounds import rrm_error_bound, rsgd_error_bound
 from perfcontrol.theory.rates.orders import OrderVerdict, compare_orders, order_by_bound
 from perfcontrol.theory.rates.propositions import (
@@ -42,6 +43,7 @@ __all__ = [
     "MeanSquareStability",
     "OrderVerdict",
     "Paper",
+    "PriceOfStability",
     "Rigorous",
     "SensitivityEnvelope",
     "SensitivityEstimate",
@@ -60,6 +62,7 @@ __all__ = [
     "hessian",
     "mean_square_stability",
     "order_by_bound",
+    "price_of_stability",
     "reaction_jacobian",
     "rrm_error_bound",
     "rsgd_error_bound",
