@@ -79,6 +79,31 @@ class TestEmpirical(RandomVectorContract):
         return pc.Empirical([[0.0, 1.0], [2.0, 1.0], [-1.0, 4.0], [-1.0, 4.0], [0.5, 0.0]])
 
 
+class TestLogNormal(RandomVectorContract):
+    def law(self):
+        return pc.LogNormal([0.2, -0.1, 0.0], 0.2 * COVARIANCE)
+
+
+class TestLogNormalOfSingularCovarianceThatVariesInTime(RandomVectorContract):
+    def law(self):
+        return pc.LogNormal([0.2, -0.1, 0.0], np.stack([0.1 * RANK_TWO, 0 * RANK_TWO]))
+
+
+class TestLogNormalOfMeanThatVariesInTime(RandomVectorContract):
+    def law(self):
+        return pc.LogNormal([[0.2, -0.1], [0.0, 0.5]], 0.1 * np.eye(2))
+
+
+class TestStochasticVolatility(RandomVectorContract):
+    def law(self):
+        return pc.StochasticVolatility([0.05, 0.5, 0.6], 0.1, stocks=2)
+
+
+class TestStochasticVolatilityAsPrinted(RandomVectorContract):
+    def law(self):
+        return pc.StochasticVolatility([0.5, 1.5], 0.1, "as_printed").resize(3)
+
+
 class TestLinear(RandomVectorContract):
     def law(self):
         return pc.Linear(pc.Uniform(0.0, 1.0), [[1.0, 2.0], [0.0, -1.0], [1.0, 1.0]], offset=[0.0, 1.0, -2.0])
@@ -101,6 +126,17 @@ def test_uniform_moments_match_closed_form():
     assert_close(law.mean, [0.5, 3.0])
     assert_close(law.covariance, np.diag([9 / 12, 36 / 12]))
     assert float(law.bound) == pytest.approx(np.hypot(2, 6))
+
+
+def test_log_normal_moments_match_scipy_and_a_gaussian_identity():
+    law = pc.LogNormal([0.3, -0.2, 0.1], COVARIANCE)
+    for i in range(3):
+        one = scipy.stats.lognorm(s=np.sqrt(COVARIANCE[i, i]), scale=np.exp([0.3, -0.2, 0.1][i]))
+        assert float(law.mean[i]) == pytest.approx(one.mean(), rel=1e-12)
+        assert float(law.covariance[i, i]) == pytest.approx(one.var(), rel=1e-12)
+    # E e^g₀ e^g₁ is the mean of the log-normal variable exp(g₀ + g₁)
+    both = scipy.stats.lognorm(s=np.sqrt(2.0 + 1.0 + 2 * 0.6), scale=np.exp(0.3 - 0.2)).mean()
+    assert float(law.covariance[0, 1] + law.mean[0] * law.mean[1]) == pytest.approx(both, rel=1e-12)
 
 
 def test_truncated_gaussian_covariance_matches_scipy_in_one_dimension():
@@ -171,6 +207,9 @@ LAWS_REFUSED = {
     "gaussian mean": (lambda: pc.Gaussian(0.0, [[1.0]]), "mean", "vector"),
     "bound zero": (lambda: pc.TruncatedGaussian([0.0], [[1.0]], 0.0), "bound", "positive"),
     "bound vector": (lambda: pc.TruncatedGaussian([0.0], [[1.0]], [1.0]), "bound", "(1,)"),
+    "log mean": (lambda: pc.LogNormal(0.1, np.eye(2)), "mean", "(T, n)"),
+    "two lengths": (lambda: pc.LogNormal(np.zeros((2, 2)), np.zeros((3, 2, 2))), "covariance", "as many as the mean"),
+    "log covariance": (lambda: pc.LogNormal([0, 0], [[1, 2], [2, 1]]), "covariance", "semidefinite"),
     "constant matrix": (lambda: pc.Constant(np.eye(2)), "value", "Sequence"),
     "sequence vector": (lambda: pc.Sequence([1.0, 2.0]), "values", "(time, n)"),
     "no samples": (lambda: pc.Empirical(np.zeros((0, 2))), "samples", "at least one"),

@@ -73,6 +73,7 @@ WRONG = {
         "a matrix": (lambda: pc.Constant(eye), "value", "vector"),
         "one time": (lambda: pc.Sequence(np.zeros(2)), "values", "time step"),
         "no sample": (lambda: pc.Empirical(np.zeros((0, 2))), "samples", "at least one row"),
+        "volatility of another size": (lambda: pc.LogNormal(np.zeros(2), np.eye(3)), "covariance", "(3, 3)"),
         "image of another law": (lambda: pc.Linear(law, np.ones((2, 3))), "matrix", "2 columns"),
     },
     "costs": {
@@ -140,10 +141,11 @@ WRONG = {
             "(3, 2, 2)",
         ),
         "unknown volatility": (
-            lambda: pc.StockPerturbation(np.ones(2), 0.1, 0.1, volatility="wild"),
+            lambda: pc.StochasticVolatility(np.ones(2), 0.1, volatility="wild"),
             "volatility",
             "'wild'",
         ),
+        "growth without a law": (lambda: pc.StockPerturbation(np.ones(2), 0.1), "growth", "pc.LogNormal"),
     },
     "solvers": {
         "no step": (lambda: pc.RSGD(0, 0.1), "steps", "at least 1"),

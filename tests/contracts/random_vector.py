@@ -66,7 +66,10 @@ class RandomVectorContract:
         law, draws = self.drawn()
         if law.bound is None:
             pytest.skip("unbounded law")
-        assert np.linalg.norm(draws, axis=-1).max() <= float(law.bound) * (1 + tolerance(1e-12, 1e-5))
+        slack = tolerance(1e-12, 1e-5) * float(law.bound)
+        assert np.linalg.norm(draws, axis=-1).max() <= float(law.bound) + slack
+        low, high = law.entry_range
+        assert float(low) - slack <= draws.min() and draws.max() <= float(high) + slack
 
     def test_draws_are_independent_over_time(self):
         law, draws = self.drawn()

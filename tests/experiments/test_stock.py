@@ -7,7 +7,7 @@ import pytest
 
 import perfcontrol as pc
 from perfcontrol.experiments import stock_market, stock_sensitivities
-from perfcontrol.perturbations.stock import growth_moments
+from perfcontrol.random_vectors.stochastic_volatility import growth_moments
 from tests.oracles.moments import expected_cost_moments
 from tests.tools import assert_close, assert_refused, tolerance
 
@@ -62,7 +62,7 @@ def test_stock_market_is_the_problem_that_the_paper_describes():
     assert_close(problem.initial_state.mean, np.repeat([0.0, 120.0], 10))
     assert_close(problem.noise.mean, np.repeat([0.0, 0.5], 10), 1e-12, 1e-6)
     assert_close(problem.noise.covariance, np.kron(np.ones((2, 2)), np.eye(10)) / 12, 1e-12, 1e-6)
-    assert_close(problem.perturbation.log_sensitivity, np.log(stock_sensitivities("descending")), 1e-12, 1e-5)
+    assert_close(problem.perturbation.growth.log_sensitivity, np.log(stock_sensitivities("descending")), 1e-12, 1e-5)
     M = np.asarray(problem.feasible_set.project(0.001 * jnp.arange(100.0).reshape(1, 10, 10)), dtype=float)
     assert_close(problem.lift(M)[0], np.kron(np.eye(2), M[0]))
     assert_close(problem.initial_policy(), np.full((1, 10, 10), EXPOSURE / 10), 1e-12, 1e-6)
@@ -199,7 +199,7 @@ def test_rsgd_approaches_the_stable_policy_when_the_step_diminishes_in_the_unsta
 def test_nothing_depends_on_the_policy_when_the_volatility_is_as_printed():
     problem = stock_market(volatility="as_printed")
     one, two = (problem.feasible_set.project(jax.random.normal(jax.random.key(k), (1, 10, 10))) for k in (1, 2))
-    variance = np.asarray(problem.perturbation.variance)
+    variance = np.asarray(problem.perturbation.growth.variance)
     assert np.abs(variance).max() < 1e-12
     means = [problem.perturbation.mean(problem.lift(M), 60) for M in (one, two)]
     assert_close(means[0], means[1], 1e-12)
@@ -207,7 +207,7 @@ def test_nothing_depends_on_the_policy_when_the_volatility_is_as_printed():
     assert costs[0] == pytest.approx(costs[1], rel=1e-11)
     assert float(pc.expected_cost(problem, two, deployed=two)) != pytest.approx(costs[0], rel=1e-3)
     expected = np.exp((0.05 - 0.18) / 60 - 0.6 / np.sqrt(60))
-    assert_close(problem.perturbation.first_moment, np.full(60, expected), 1e-12)
+    assert_close(problem.perturbation.growth.first_moment, np.full(60, expected), 1e-12)
 
 
 # --- bad input -------------------------------------------------------------------------------------------------------

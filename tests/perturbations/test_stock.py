@@ -7,7 +7,7 @@ import pytest
 import scipy.integrate
 
 import perfcontrol as pc
-from perfcontrol.perturbations.stock import growth_moments
+from perfcontrol.random_vectors.stochastic_volatility import growth_moments
 from tests.contracts.perturbation import PerturbationContract
 from tests.tools import assert_close, assert_refused, normal
 
@@ -23,7 +23,9 @@ class StockContract(PerturbationContract):
     volatility = "lognormal"
 
     def perturbation(self):
-        return pc.StockPerturbation(SENSITIVITIES, 0.05, EXPOSURE, self.volatility)
+        return pc.StockPerturbation(
+            pc.StochasticVolatility(SENSITIVITIES, 0.05, self.volatility, self.shape[-1] // 2), EXPOSURE
+        )
 
 
 class TestOnTheSimplex(StockContract):
@@ -46,6 +48,44 @@ class TestOnABall(StockContract):
 class TestWithoutStructure(StockContract):
     structure = pc.FullStructure()
     feasible_set = pc.RowSimplex(EXPOSURE)
+
+
+class StocksOfTheirOwn(StockContract):
+    """Drifts, volatilities and a correlation; the mean of Δ then depends on the policy even where row sums do not."""
+
+    shape = (1, 6, 6)
+    knows = ("mean", "covariance", "sensitivity")
+    drift = np.array([0.1, -0.05, 0.02])
+    spread = np.array([[0.3, 0.2, 0.0], [0.2, 0.4, -0.1], [0.0, -0.1, 0.1]])
+
+    def perturbation(self):
+        return pc.StockPerturbation(pc.LogNormal(self.drift, self.spread), EXPOSURE)
+
+
+class TestStocksOfTheirOwnOnTheSimplex(StocksOfTheirOwn):
+    feasible_set = pc.RowSimplex(EXPOSURE)
+
+
+class TestStocksOfTheirOwnOnRowSums(StocksOfTheirOwn):
+    feasible_set = pc.RowSum(EXPOSURE)
+
+
+class TestStocksThatVaryInTime(StocksOfTheirOwn):
+    feasible_set = pc.FrobeniusBall(0.7)
+    spread = np.array([1.0, 0.2, 0.0])[:, None, None] * StocksOfTheirOwn.spread
+
+
+class TestRecordedDays(StocksOfTheirOwn):
+    feasible_set = pc.RowSimplex(EXPOSURE)
+    knows = ("mean", "covariance", "bound", "sensitivity")
+
+    def perturbation(self):
+        days = [[1.1, 0.9, 1.0], [0.8, 0.7, 1.2], [1.0, 1.5, 1.0], [1.0, 1.0, 0.6]]
+        return pc.StockPerturbation(pc.Empirical(days), EXPOSURE)
+
+
+class TestRecordedDaysOnABall(TestRecordedDays):
+    feasible_set = pc.FrobeniusBall(0.7)
 
 
 class TestAsPrinted(StockContract):
@@ -82,7 +122,7 @@ def test_growth_moments_match_adaptive_quadrature(kind):
 
 def test_stock_moments_match_their_closed_form():
     """E V = g₁ (row sums), Cov V = (g₂ - g₁²) (portfolio portfolioᵀ) on the diagonals of Δ's blocks."""
-    law = pc.StockPerturbation(SENSITIVITIES, 0.05, EXPOSURE)
+    law = pc.StockPerturbation(pc.StochasticVolatility(SENSITIVITIES, 0.05, stocks=3), EXPOSURE)
     block = np.abs(np.asarray(normal(1, 1, 3, 3)))
     M = pc.RepeatedBlock(2).lift(jnp.asarray(block))
     portfolio = block[0] / EXPOSURE
@@ -101,19 +141,56 @@ def test_stock_moments_match_their_closed_form():
 
 def test_as_printed_volatility_has_next_to_no_variance():
     """The Gaussian of the paper's sensitivities is below the clip: v = -0.6, and nothing reacts."""
-    law = pc.StockPerturbation([0.001, 0.05, 0.1], 0.05, EXPOSURE, "as_printed")
+    growth = pc.StochasticVolatility([0.001, 0.05, 0.1], 0.05, "as_printed", stocks=3)
+    law = pc.StockPerturbation(growth, EXPOSURE)
     M = pc.RepeatedBlock(2).lift(jnp.full((1, 3, 3), EXPOSURE / 3))
     drawn = np.asarray(law.sample(jax.random.key(0), M, 3).dense())
     assert np.abs(drawn - np.asarray(law.mean(M, 3))).max() < 1e-9
 
 
+def test_moments_of_correlated_stocks_match_enumeration_of_recorded_days():
+    days = np.array([[1.1, 0.9, 1.0], [0.8, 0.7, 1.2], [1.0, 1.5, 1.0], [1.0, 1.0, 0.6]])
+    law = pc.StockPerturbation(pc.Empirical(days), EXPOSURE)
+    block = np.asarray(normal(5, 1, 3, 3))
+    M = pc.RepeatedBlock(2).lift(jnp.asarray(block))
+    V = np.stack([np.diag(block[0] / EXPOSURE @ day) for day in days])
+    mean, zero = V.mean(axis=0), np.zeros((3, 3))
+    draws = np.stack([np.block([[mean - np.eye(3), one - mean], [zero, one - np.eye(3)]]) for one in V])
+    centred = draws - draws.mean(axis=0)
+    X, Y = np.asarray(normal(2, 6, 6)), np.asarray(normal(3, 6, 6))
+    for t in range(2):
+        assert_close(law.mean(M, 2)[t], draws.mean(axis=0))
+        assert_close(law.covariance(M, 2).apply(jnp.asarray(X))[t], np.mean([D @ X @ D.T for D in centred], axis=0))
+        assert_close(law.covariance(M, 2).adjoint(jnp.asarray(Y))[t], np.mean([D.T @ Y @ D for D in centred], axis=0))
+    drawn = np.asarray(law.sample(jax.random.key(0), M, 5).dense())
+    assert all(np.abs(draws - one).max(axis=(1, 2)).min() < 1e-5 for one in drawn)
+
+
+def test_means_are_free_of_the_policy_only_where_stocks_grow_alike():
+    lifted = TestStocksOfTheirOwnOnRowSums().lifted_set()
+    assert not pc.StockPerturbation(pc.LogNormal([0.1, 0.1, 0.0], np.eye(3)), EXPOSURE).policy_free_mean(lifted)
+    assert pc.StockPerturbation(pc.LogNormal([0.1, 0.1, 0.1], np.eye(3)), EXPOSURE).policy_free_mean(lifted)
+
+
+def paper(sensitivities, **changes):
+    return pc.StochasticVolatility(sensitivities, **({"rate": 0.05} | changes))
+
+
+def fit(growth, shape, horizon):
+    return pc.StockPerturbation(growth, 0.4).resize(shape, horizon)
+
+
 STOCKS_REFUSED = {
-    "negative": (lambda: pc.StockPerturbation([0.1, -0.1], 0.05, 0.4), "sensitivities", "positive"),
-    "matrix": (lambda: pc.StockPerturbation([[0.1]], 0.05, 0.4), "sensitivities", "(1, 1)"),
-    "volatility": (lambda: pc.StockPerturbation([0.1], 0.05, 0.4, "normal"), "volatility", "'normal'"),
-    "rate": (lambda: pc.StockPerturbation([0.1], [0.05], 0.4), "rate", "(1,)"),
-    "odd state": (lambda: pc.StockPerturbation([0.1], 0.05, 0.4).check((1, 3, 3), 1), "perturbation", "2L"),
-    "days": (lambda: pc.StockPerturbation([0.1], 0.05, 0.4).check((1, 4, 4), 3), "sensitivities", "(3,)"),
+    "negative": (lambda: paper([0.1, -0.1]), "sensitivities", "positive"),
+    "matrix": (lambda: paper([[0.1]]), "sensitivities", "(1, 1)"),
+    "volatility": (lambda: paper([0.1], volatility="normal"), "volatility", "'normal'"),
+    "rate": (lambda: paper([0.1], rate=[0.05]), "rate", "(1,)"),
+    "stocks": (lambda: paper([0.1], stocks=0), "stocks", "at least 1"),
+    "no law": (lambda: pc.StockPerturbation([0.1], 0.4), "growth", "pc.LogNormal(mean, covariance)"),
+    "exposure": (lambda: pc.StockPerturbation(paper([0.1]), [0.4]), "exposure", "(1,)"),
+    "odd state": (lambda: fit(paper([0.1]), (1, 3, 3), 1), "perturbation", "2L"),
+    "days": (lambda: fit(paper([0.1]), (1, 4, 4), 3), "growth", "cover the horizon of 3"),
+    "stocks of another market": (lambda: fit(pc.LogNormal(np.zeros(3), np.eye(3)), (1, 4, 4), 3), "growth", "3"),
 }
 
 

@@ -18,7 +18,7 @@ from perfcontrol._checks import as_array, check_shape, fail
 from perfcontrol.costs import QuadraticCost
 from perfcontrol.perturbations import StockPerturbation
 from perfcontrol.problem import PerformativeProblem
-from perfcontrol.random_vectors import Linear, Uniform
+from perfcontrol.random_vectors import Linear, StochasticVolatility, Uniform
 from perfcontrol.sets import AbstractSet, RepeatedBlock, RowSimplex, RowSum
 from perfcontrol.systems import LinearSystem
 
@@ -101,7 +101,7 @@ def stock_market(
         noise=Linear(unit_noise, np.vstack([eye, eye]), np.concatenate([-np.full(STOCKS, 0.5), np.zeros(STOCKS)])),
         cost=QuadraticCost(shown, shown),
         memory=1,
-        perturbation=StockPerturbation(stock_sensitivities(order), rate, exposure, volatility),
+        perturbation=StockPerturbation(StochasticVolatility(stock_sensitivities(order), rate, volatility), exposure),
         feasible_set=sets[feasible_set],
         initial_state=jnp.concatenate([jnp.zeros(STOCKS), jnp.full(STOCKS, investment)]),
         structure=RepeatedBlock(2),

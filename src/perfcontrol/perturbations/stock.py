@@ -1,67 +1,30 @@
-"""The stock market of the paper (Appendix A, Example 1): volatile prices seen through the investor's portfolio.
+"""A stock market (Appendix A, Example 1): volatile prices seen through the investor's portfolio.
 
 State x = [r; q] of L stocks each. With the portfolio p = M[0][:L, :L] / exposure (row l spreads the return of
-stock l) and e_i = exp((rate - v_i²/2)/T + v_i/√T) for the volatility v_i, V = diag(p e) and
+stock l) and the day's price ratios e, of any law, V = diag(p e) and
 
     Δ = [[E V - I, V - E V], [0, V - I]].
 
 Every operator here costs O(L) or O(L²); nothing dense is built in the loops.
 """
 
-import itertools
 import math
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Key
-from scipy import special
 
-from perfcontrol._checks import as_array, check_shape, fail, is_concrete
-from perfcontrol._linalg import Diagonal
+from perfcontrol._checks import as_array, check_instance, check_shape, fail, is_concrete
+from perfcontrol._linalg import Diagonal, along_time
 from perfcontrol.perturbations.base import AbstractPerturbation, CovarianceOperator, Draws
-
-SPREAD = 0.2  # standard deviation of the Gaussian behind the volatility
-LIMIT = 0.6  # the volatility is projected to [-LIMIT, LIMIT]
-VOLATILITIES = ("lognormal", "as_printed")
+from perfcontrol.random_vectors import AbstractRandomVector, fitted_vector
 
 
-def _volatility(normal: Any, log_sensitivity: Any, kind: str, xp: Any) -> Any:
-    """v from a standard normal: clip(exp(N(log ε, 0.2²))), or clip(N(log ε, 0.2²)) as printed."""
-    gaussian = log_sensitivity + SPREAD * normal
-    return xp.clip(xp.exp(gaussian) if kind == "lognormal" else gaussian, -LIMIT, LIMIT)
+class StockDraws(Draws):
+    """Draws of Δ by the diagonals of V - E V and E V - I."""
 
-
-def _growth(volatility: Any, rate: Any, horizon: int, xp: Any) -> Any:
-    """exp((rate - v²/2)/T + v/√T): the day's price ratio."""
-    return xp.exp((rate - volatility**2 / 2) / horizon + volatility / math.sqrt(horizon))
-
-
-def growth_moments(log_sensitivity: np.ndarray, rate: float, kind: str) -> tuple[np.ndarray, np.ndarray]:
-    """E e and E e² for each time, by Gauss-Legendre quadrature between the kinks of the clip."""
-    horizon = len(log_sensitivity)
-    nodes, weights = np.polynomial.legendre.leggauss(80)
-    first, second = np.zeros(horizon), np.zeros(horizon)
-    for t, centre in enumerate(log_sensitivity):
-        ends = (-np.inf, math.log(LIMIT)) if kind == "lognormal" else (-LIMIT, LIMIT)
-        kinks = [float(np.clip((end - centre) / SPREAD, -9.0, 9.0)) for end in ends]
-        edges = np.unique([-9.0, *kinks, 9.0])
-        for low, high in itertools.pairwise(edges):
-            normal = (low + high) / 2 + (high - low) / 2 * nodes
-            density = np.exp(-(normal**2) / 2) / math.sqrt(2 * math.pi) * weights * (high - low) / 2
-            growth = _growth(_volatility(normal, centre, kind, np), rate, horizon, np)
-            first[t] += density @ growth
-            second[t] += density @ growth**2
-        tails = 2 * special.ndtr(-9.0)  # what lies beyond nine standard deviations, put at the centre
-        centre_growth = _growth(_volatility(0.0, centre, kind, np), rate, horizon, np)
-        first[t] += tails * centre_growth
-        second[t] += tails * centre_growth**2
-    return first, second
-
-
-class _StockDraws(Draws):
     deviation: Array  # (T, L): V - E V
     mean_diagonal: Array  # (T, L): E V - 1
 
@@ -89,120 +52,109 @@ class _StockDraws(Draws):
 
 
 class _StockCovariance(CovarianceOperator):
-    variance: Array  # (T,): of e
-    gram: Array  # (L, L): portfolio portfolioᵀ
+    spread: Array  # (T, L, L): of V's diagonal, portfolio Cov(e) portfolioᵀ
 
     @property
     def steps(self) -> Any:
-        return self.variance
+        return self.spread
 
     def apply_step(self, step: Any, X: Array) -> Array:
-        count = self.gram.shape[-1]
-        block = step * self.gram * X[count:, count:]
-        return jnp.tile(block, (2, 2))
+        count = step.shape[-1]
+        return jnp.tile(step * X[count:, count:], (2, 2))
 
     def adjoint_step(self, step: Any, X: Array) -> Array:
-        count = self.gram.shape[-1]
+        count = step.shape[-1]
         total = X[:count, :count] + X[:count, count:] + X[count:, :count] + X[count:, count:]
-        return jnp.pad(step * self.gram * total, ((count, 0), (count, 0)))
+        return jnp.pad(step * total, ((count, 0), (count, 0)))
 
 
 class StockPerturbation(AbstractPerturbation):
-    """Policy-dependent returns of the paper's stock market.
+    """Policy-dependent returns of a stock market.
 
     Args:
-        sensitivities: (T,), positive: the paper's ε_t, which set the volatility of day t.
-        rate: riskless interest rate over the horizon.
+        growth: the law of the day's price ratios e_t, one entry a stock: `pc.LogNormal` for drifts, volatilities and
+            correlations, constant or varying in time, `pc.Empirical` for recorded days, `pc.StochasticVolatility` for
+            the paper's.
         exposure: h/(24-h), the factor between the policy block and the portfolio.
-        volatility: "lognormal" (v = clip(exp N(log ε, 0.2²))) or "as_printed" (v = clip(N(log ε, 0.2²)),
-            which is -0.6 almost surely, so that nothing depends on the policy).
+
+    Raises:
+        InputError: no random vector; a law for another number of stocks or of days.
 
     References:
         Appendix A, equations (Example 1-A) and (Example 1-V(M)).
     """
 
-    log_sensitivity: Array
-    rate: Array
+    growth: AbstractRandomVector
     exposure: Array
-    first_moment: Array
-    variance: Array  # held apart from the moments: in float32 their difference would be mostly rounding
-    volatility: str = eqx.field(static=True)
 
-    def __init__(self, sensitivities: Any, rate: Any, exposure: Any, volatility: str = "lognormal"):
-        sensitivities = as_array("sensitivities", sensitivities)
-        if sensitivities.ndim != 1 or (is_concrete(sensitivities) and np.any(np.asarray(sensitivities) <= 0)):
-            raise fail("sensitivities", f"{sensitivities.shape}", "be positive numbers (T,)", "One per day.")
-        if volatility not in VOLATILITIES:
-            raise fail("volatility", repr(volatility), f"be one of {VOLATILITIES}", "Pass one of these names.")
-        self.rate, self.exposure = as_array("rate", rate), as_array("exposure", exposure)
-        for name, value in (("rate", self.rate), ("exposure", self.exposure)):
-            check_shape(name, value, (), (), "Pass one number.")
-        self.log_sensitivity = jnp.log(sensitivities)
-        self.volatility = volatility
-        first, second = growth_moments(np.log(np.asarray(sensitivities, dtype=float)), float(self.rate), volatility)
-        self.first_moment = jnp.asarray(first, sensitivities.dtype)
-        self.variance = jnp.asarray(second - first**2, sensitivities.dtype)
+    def __init__(self, growth: AbstractRandomVector, exposure: Any):
+        self.growth = check_instance("growth", growth, AbstractRandomVector, "pc.LogNormal(mean, covariance)")
+        self.exposure = as_array("exposure", exposure)
+        check_shape("exposure", self.exposure, (), (), "Pass one number.")
 
-    def check(self, policy_shape: tuple[int, int, int], horizon: int) -> None:
+    def resize(self, policy_shape: tuple[int, int, int], horizon: int) -> "StockPerturbation":
         _, m, n = policy_shape
         if m != n or n % 2:
             raise fail("perturbation", f"m, n = {m}, {n}", "have m = n = 2L", "The state is [r; q] of L stocks.")
-        check_shape("sensitivities", self.log_sensitivity, (horizon,), ("horizon",), "Give one sensitivity per day.")
+        return StockPerturbation(fitted_vector("growth", self.growth, n // 2, horizon), self.exposure)
 
     def portfolio(self, M: Array) -> Array:
         """The portfolio (L, L) behind a lifted policy."""
         count = M.shape[-1] // 2
         return M[0, :count, :count] / self.exposure
 
-    def _mean_growth(self, M: Array) -> Array:
-        return self.first_moment[:, None] * jnp.sum(self.portfolio(M), axis=-1)
+    def _mean_growth(self, M: Array, horizon: int) -> Array:
+        return along_time(self.growth.mean, 1, horizon) @ self.portfolio(M).T
 
     def sample(self, key: Key[Array, ""], M: Array, horizon: int) -> Draws:
-        portfolio = self.portfolio(M)
-        normal = jax.random.normal(key, (horizon, portfolio.shape[-1]), M.dtype)
-        volatility = _volatility(normal, self.log_sensitivity[:, None], self.volatility, jnp)
-        growth = _growth(volatility, self.rate, self.log_sensitivity.shape[0], jnp)
-        deviation = (growth - self.first_moment[:, None]) @ portfolio.T
-        return _StockDraws(deviation, self._mean_growth(M) - 1)
+        deviation = (self.growth.sample(key, horizon) - self.growth.mean).astype(M.dtype) @ self.portfolio(M).T
+        return StockDraws(deviation, self._mean_growth(M, horizon) - 1)
 
     def mean(self, M: Array, horizon: int) -> Array:
         return self.mean_operator(M, horizon).dense()
 
     def mean_operator(self, M: Array, horizon: int) -> Diagonal:
-        return Diagonal(jnp.tile(self._mean_growth(M) - 1, (1, 2)))
+        return Diagonal(jnp.tile(self._mean_growth(M, horizon) - 1, (1, 2)))
 
     def covariance(self, M: Array, horizon: int) -> CovarianceOperator:
         portfolio = self.portfolio(M)
-        return _StockCovariance(self.variance, portfolio @ portfolio.T)
+        return _StockCovariance(along_time(portfolio @ self.growth.covariance @ portfolio.T, 2, horizon))
 
     def bound(self, feasible_set: Any, horizon: int) -> Array | None:
         """Known on a bounded set: per stock the 2 x 2 block has Frobenius norm √(a² + b² + (a+b)²)."""
-        if feasible_set.radius is None:
+        if feasible_set.radius is None or self.growth.entry_range is None:
             return None
-        lowest, highest = self._growth_range(horizon)
+        lowest, highest = self.growth.entry_range
         # ‖row of the portfolio‖₁ is known on the simplex; elsewhere at most √L times the radius over the exposure
-        if self.policy_free_mean(feasible_set) and feasible_set.nonnegative:
+        if _fixes_rows(feasible_set) and feasible_set.nonnegative:
             weight = feasible_set.row_total / self.exposure
             value_low, value_high = weight * lowest, weight * highest
         else:
             count = feasible_set.policy_size // 2
             weight = math.sqrt(count) * feasible_set.radius / self.exposure
-            value_low, value_high = -weight * highest, weight * highest
+            value_high = weight * jnp.maximum(jnp.abs(lowest), jnp.abs(highest))
+            value_low = -value_high
         largest = jnp.maximum(jnp.abs(value_high - 1), jnp.abs(value_low - 1))
         return jnp.broadcast_to(jnp.max(jnp.sqrt(2 * largest**2 + (value_high - value_low) ** 2)), (horizon,))
 
     def sensitivity(self, feasible_set: Any, horizon: int) -> Array:
-        """√(2 Var e) / exposure where the set fixes the row sums, else with L (E e)² added under the root."""
-        variance = self.variance
-        if not self.policy_free_mean(feasible_set):
-            variance = variance + feasible_set.policy_size / 2 * self.first_moment**2
-        return jnp.sqrt(2 * variance) / self.exposure
+        """√(2 λ_max(Cov e + E e E eᵀ)) / exposure, on the directions that keep row sums where the set fixes them."""
+        mean, spread = self.growth.mean, self.growth.covariance
+        if _fixes_rows(feasible_set):
+            mean = mean - jnp.mean(mean, axis=-1, keepdims=True)
+            centre = jnp.eye(mean.shape[-1], dtype=mean.dtype) - 1 / mean.shape[-1]
+            spread = centre @ spread @ centre
+        spread = spread + mean[..., :, None] * mean[..., None, :]
+        largest = jnp.maximum(jnp.linalg.eigvalsh(spread)[..., -1], 0)
+        return jnp.broadcast_to(jnp.sqrt(2 * largest) / self.exposure, (horizon,))
 
     def policy_free_mean(self, feasible_set: Any) -> bool:
-        """Whether the set fixes the row sums of the portfolio: those of the free parameters, if these are its block."""
-        return feasible_set.row_total is not None and feasible_set.free_columns == feasible_set.policy_size // 2
+        """Whether the set fixes the row sums of the portfolio, and all stocks are known to grow alike in the mean."""
+        mean = self.growth.mean
+        alike = is_concrete(mean) and bool(np.all(np.asarray(mean) == np.asarray(mean)[..., :1]))
+        return _fixes_rows(feasible_set) and alike
 
-    def _growth_range(self, horizon: int) -> tuple[Array, Array]:
-        """The almost-sure range of e; it grows with v up to v = √T, beyond the clip for T ≥ 1."""
-        low = 0.0 if self.volatility == "lognormal" else -LIMIT
-        return _growth(low, self.rate, horizon, jnp), _growth(LIMIT, self.rate, horizon, jnp)
+
+def _fixes_rows(feasible_set: Any) -> bool:
+    """Whether the set fixes the row sums of the portfolio: those of the free parameters, if these are its block."""
+    return feasible_set.row_total is not None and feasible_set.free_columns == feasible_set.policy_size // 2

@@ -6,6 +6,7 @@ Covariance is always about the mean; second moments are never stored.
 """
 
 import abc
+from typing import Any
 
 import equinox as eqx
 from jaxtyping import Array, Float, Key
@@ -32,6 +33,11 @@ class AbstractRandomVector(eqx.Module):
     @abc.abstractmethod
     def sample(self, key: Key[Array, ""], horizon: int) -> Float[Array, "horizon n"]:
         """Independent draws for t = 0..horizon-1."""
+
+    @property
+    def entry_range(self) -> tuple[Any, Any] | None:
+        """Two numbers between which every entry almost surely lies; None if unbounded."""
+        return None if self.bound is None else (-self.bound, self.bound)
 
     def resize(self, size: int) -> "AbstractRandomVector":
         """This law in dimension `size`: scalar parameters are repeated, anything else must fit already."""

@@ -37,5 +37,9 @@ class Empirical(AbstractRandomVector):
     def bound(self) -> Array:
         return jnp.max(jnp.linalg.norm(self.samples, axis=-1))
 
+    @property
+    def entry_range(self) -> tuple[Array, Array]:
+        return jnp.min(self.samples), jnp.max(self.samples)
+
     def sample(self, key: Key[Array, ""], horizon: int) -> Array:
         return self.samples[jax.random.randint(key, (horizon,), 0, self.samples.shape[0])]

@@ -53,16 +53,17 @@ def repeated_minimisation(
         rows["agreement"].append(float(np.linalg.norm(np.asarray(repeated.M) - M) / np.linalg.norm(M)))
         rows["cost"].append(float(expected_cost(problem, M)))
     perturbation: Any = problems_of(settings, settings.feasible_set, "as_printed")[0].perturbation
+    growth = perturbation.growth
     # Exact evaluation sees a perturbation's moments alone: those as printed, in the program that is compiled already.
     printed = eqx.tree_at(
-        lambda p: (p.perturbation.first_moment, p.perturbation.variance),
+        lambda p: (p.perturbation.growth.first_moment, p.perturbation.growth.variance),
         problems[0],
-        (perturbation.first_moment, perturbation.variance),
+        (growth.first_moment, growth.variance),
     )
     ends = [solve(printed, RRM(), start, throw=False) for start in starts]
     responses = [np.asarray(end.history[1]) for end in ends]
     return exact.merge(by_case(rows)).assign(
-        printed_variance=float(np.max(np.abs(np.asarray(perturbation.variance)))),
+        printed_variance=float(np.max(np.abs(np.asarray(growth.variance)))),
         printed_steps=max(int(end.steps) for end in ends),
         printed_difference=float(np.max(np.abs(responses[0] - responses[1]))),
     )
