@@ -164,6 +164,8 @@ WRONG = {
         "negative ridge": (lambda: pc.EstimatedDynamics(-1.0), "ridge", "1e-6"),
         "region without a run": (lambda: pc.confidence_region(M), "solution", "average=True"),
         "no start": (lambda: pc.PerformativeOptimum(starts=0), "starts", "at least 1"),
+        "no inner step": (lambda: pc.RRM(inner_steps=0), "inner_steps", "at least 1"),
+        "memory below none": (lambda: pc.RRM(anderson=-1), "anderson", "at least 0"),
         "negative tolerance": (lambda: pc.RRM(tolerance=-1), "tolerance", "got -1"),
         "tolerance by name": (lambda: pc.StablePoint(tolerance="small"), "tolerance", "'small'"),
         "tolerance below rounding": (lambda: pc.solve(problem, pc.RRM(tolerance=1e-30)), "tolerance", "can reach"),

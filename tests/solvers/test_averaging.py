@@ -1,5 +1,7 @@
 """Averaged iterates: their definition, the covariance against closed forms and samples, the region's coverage."""
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -213,7 +215,8 @@ def test_average_refuses_settings_that_make_no_sense():
     assert_refused(lambda: pc.Average(1.0), "burn_in", "[0, 1)")
     assert_refused(lambda: pc.Average(covariance="hessian"), "covariance", "batch means")
     assert_refused(lambda: pc.RSGD(5, 0.1, average=3), "average", "pc.Average")
-    assert_refused(lambda: pc.RSGD(5, 0.1, average=True, transform=object()), "transform", "plain steps")
+    momentum = SimpleNamespace(update=None)
+    assert_refused(lambda: pc.RSGD(5, 0.1, average=True, transform=momentum), "transform", "plain steps")
     few = pc.RSGD(40, 0.1, average=pc.Average(covariance="batch means"))
     assert_refused(lambda: pc.solve(performative_prediction(0.5), few, key=KEY), "steps", "44")
     assert_refused(lambda: pc.PowerStep(0.0), "eta", "positive")

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from perfcontrol._linalg import frobenius, solve
-from perfcontrol._programs import numerics, program
+from perfcontrol._programs import numerics, program, while_loop
 from perfcontrol.response.quadratic import Operator, Quadratic
 from perfcontrol.sets import AbstractSet, Unconstrained
 
@@ -34,6 +34,17 @@ def _project(feasible_set: AbstractSet, M: Any) -> Array:
 def nearest(feasible_set: AbstractSet, M: Any) -> Any:
     """The nearest policy of the set."""
     return M if isinstance(feasible_set, Unconstrained) else _project(feasible_set, M)
+
+
+def gradient_steps(feasible_set: AbstractSet, gradient: Operator, step: Any, start: Any, count: int) -> Any:
+    """`count` steps M ← Proj(M - step · gradient(M)) from `start`."""
+
+    def advance(carry: Any) -> Any:
+        M, taken = carry
+        return nearest(feasible_set, M - step * gradient(M)), taken + 1
+
+    xp, _ = numerics(start, step)
+    return while_loop(lambda carry: carry[1] < count, advance, (start, xp.asarray(0)))[0]
 
 
 class Projected:

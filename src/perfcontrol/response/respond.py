@@ -25,9 +25,9 @@ from perfcontrol.problem import PerformativeProblem, check_problem
 from perfcontrol.response import quadratic as quadratics
 from perfcontrol.response.affine import Affine, AffineByProducts
 from perfcontrol.response.estimate import SampleAverage, estimate_response, is_exact
-from perfcontrol.response.projected import Projected, nearest
+from perfcontrol.response.projected import Projected, gradient_steps, nearest
 from perfcontrol.response.quadratic import Factors, Operator, factors, quadratic, quadratic_by_passes, stationary
-from perfcontrol.response.sampled import Sampled, minimise, sampled_jacobian, sampled_residual
+from perfcontrol.response.sampled import Sampled, approach, minimise, sampled_jacobian, sampled_residual
 from perfcontrol.response.separable import Separable
 from perfcontrol.sets import FullStructure, Unconstrained
 
@@ -83,14 +83,18 @@ def _sound(form: Any) -> Any:
     return xp.all(xp.stack([xp.all(xp.isfinite(leaf)) for leaf in leaves]))
 
 
-def _respond(problem: PerformativeProblem, deployed: Any, start: Any) -> Response:
+def _respond(problem: PerformativeProblem, deployed: Any, start: Any, inner_steps: int | None) -> Response:
     world = world_of(problem, deployed)
     form = _shape_of_cost(problem, world)
     xp, _ = numerics(form, start)
     sound = _sound(form)
     if known(sound) and not sound:
         return Response(xp.full_like(start, xp.nan), xp.asarray(False))
-    M, unique = _method(problem, world, form).minimise(start)
+    if inner_steps is None:
+        M, unique = _method(problem, world, form).minimise(start)
+    else:
+        step = _step(problem, world, form)
+        M, unique = gradient_steps(problem.feasible_set, form.gradient, step, start, inner_steps), xp.asarray(True)
     # Pseudo-inverses turn an overflow into finite nonsense: no number at all is the honest answer.
     return Response(xp.where(sound, M, xp.nan), unique)
 
@@ -98,17 +102,22 @@ def _respond(problem: PerformativeProblem, deployed: Any, start: Any) -> Respons
 _respond_in_one_program = program(_respond)
 
 
-def respond(problem: PerformativeProblem, deployed: Any, start: Any = None) -> Response:
-    """Φ(deployed) in the free parameters; pure, works under jit and vmap; carries no derivative."""
+def respond(problem: PerformativeProblem, deployed: Any, start: Any = None, inner_steps: int | None = None) -> Response:
+    """Φ(deployed) in the free parameters; pure, works under jit and vmap; carries no derivative.
+
+    With `inner_steps` only so many gradient steps towards it, from `start`; `unique` is then not looked at.
+    """
     start = deployed if start is None else start
     if isinstance(problem, Sampled):
+        if inner_steps is not None:
+            return Response(approach(problem, on_host(deployed), on_host(start), inner_steps), np.asarray(True))
         return Response(*minimise(problem, on_host(deployed), on_host(start)))
     if known(problem, deployed, start) and _held(problem):
         with np.errstate(all="ignore"):
-            return _respond(problem, on_host(deployed), on_host(start))
+            return _respond(problem, on_host(deployed), on_host(start), inner_steps)
     # Loops are not differentiated: nothing that varies goes in.
     arrays, rest = eqx.partition((problem, deployed, start), eqx.is_array)
-    return _respond_in_one_program(*eqx.combine(jax.lax.stop_gradient(arrays), rest))
+    return _respond_in_one_program(*eqx.combine(jax.lax.stop_gradient(arrays), rest), inner_steps)
 
 
 def response_hessian(problem: PerformativeProblem, world: World) -> Any:

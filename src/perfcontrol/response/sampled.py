@@ -170,6 +170,41 @@ def minimise(world: Sampled, deployed: Any, start: Any) -> tuple[Any, Any]:
     return xp.where(sound, M, xp.nan), unique
 
 
+def approach(world: Sampled, deployed: Any, start: Any, count: int) -> Any:
+    """`count` projected gradient steps towards Φ_N(deployed) from `start`, NaN where the paths overflow.
+
+    A step is 1/‖Hessian‖ long, halved until the cost falls below the quadratic bound that this length stands for.
+    """
+    xp, _ = numerics(world, deployed, start)
+    precision, tiny = xp.finfo(start.dtype).eps, xp.finfo(start.dtype).tiny
+
+    def longest(at: Averages) -> Any:
+        return 1 / xp.maximum(xp.linalg.eigvalsh(at.hessian)[-1], tiny)
+
+    def advance(carry: Any) -> Any:
+        M, at, step, taken, tried = carry
+        ahead = nearest(world.feasible_set, M - step * at.gradient)
+        there = averages(world, ahead, deployed)
+        moved = ahead - M
+        bound = at.cost + xp.sum(at.gradient * moved) + xp.sum(moved**2) / (2 * step)
+        good = _finite(there) & (there.cost <= bound + 100 * precision * xp.abs(at.cost))
+        M, at = choose(good, (ahead, there), (M, at))
+        return M, at, xp.where(good, longest(at), step / 2), taken + good, tried + 1
+
+    def unfinished(carry: Any) -> Any:
+        *_, taken, tried = carry
+        return (taken < count) & (tried < count + NEWTON_STEPS)
+
+    M = nearest(world.feasible_set, start)
+    at = averages(world, M, deployed)
+    sound = _finite(at)
+    if known(sound) and not sound:
+        return xp.full_like(start, xp.nan)
+    zero = xp.asarray(0)
+    M, *_ = while_loop(unfinished, advance, (M, at, longest(at), zero, zero))
+    return xp.where(sound, M, xp.nan)
+
+
 def sampled_jacobian(world: Sampled, deployed: Any, response: Any) -> Any:
     """Φ_N'(deployed), (p, p), given Φ_N(deployed), by the implicit function theorem."""
     model = _model(world, averages(world, response, deployed), response)
