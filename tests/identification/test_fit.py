@@ -132,6 +132,21 @@ def test_affine_reaction_of_mean_and_scale_is_recovered_with_its_gain() -> None:
     assert np.abs(np.asarray(problem.perturbation.mean(jnp.zeros((1, 1, 2)), 10))).max() < 1e-12
 
 
+def test_auto_finds_a_reaction_to_as_many_directions_of_the_policy_as_there_are_deployments() -> None:
+    axis, part = np.array([0.5, -0.5, 0.5, 0.5]).reshape(2, 1, 2), np.array([[0.3, 0.0], [-0.2, 0.4]])
+    policies = [np.zeros((2, 1, 2)), *0.6 * np.eye(4).reshape(4, 2, 1, 2)]
+    world = WORLD.but(mean=lambda M: part * np.sum(M * axis), scale=lambda M: np.array([0.3]))
+    fit = fitted(pc.Logs(*world.logs(8, policies, 60, 30)), reaction="auto")
+    assert (fit.mean_features.name, fit.scale_features.name) == ("affine", "constant")
+
+
+def test_auto_takes_deployments_of_one_episode_each() -> None:
+    r = np.random.default_rng(11)
+    logs = pc.Logs(*WORLD.logs(11, [0.5 * r.standard_normal((1, 1, 2)) for _ in range(60)], 1, 40))
+    fit = fitted(logs, reaction="auto")
+    assert fit.mean_features.name == "constant" and fit.scale_features.name in ("norm", "squared norm")
+
+
 def test_own_features_give_the_fit_of_the_feature_that_they_equal() -> None:
     own = fitted(reaction=lambda M: jnp.sum(M**2)[None])
     known = fitted(reaction="squared norm")

@@ -27,8 +27,8 @@ class Features(NamedTuple):
     def values(self, policies: np.ndarray) -> np.ndarray:
         """(1, f(M)) for each of the policies, (G, 1 + q)."""
         with jax.ensure_compile_time_eval():  # numbers, also where somebody traces a function that asks for them
-            rows = [np.asarray(self.function(jnp.asarray(M)), dtype=float) for M in policies]
-        return np.array([np.concatenate([[1.0], row]) for row in rows])
+            values = np.asarray(jax.vmap(self.function)(jnp.asarray(policies)), dtype=float)
+        return np.concatenate([np.ones((len(values), 1)), values], axis=1)
 
 
 CONSTANT = Features("constant", lambda M: jnp.zeros(0), lambda c: c[..., 0])

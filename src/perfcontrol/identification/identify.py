@@ -135,7 +135,8 @@ def _chosen(asked: dict[str, Features], data: Transitions, directions: np.ndarra
 
 def _selected(data: Transitions, directions: np.ndarray, wanted: set[str]) -> dict[str, Features]:
     n, reacting = data.y.shape[1], _reacting(data, directions)
-    first = moments(data, directions, _free(data), np.eye(len(data.policies)), reacting)
+    free, count = _free(data), len(data.policies)
+    first = moments(data, directions, free, np.eye(count) if count <= SATURATED else free, reacting)
     whiten = first.whiten()
     chosen = {}
     if "mean" in wanted:
