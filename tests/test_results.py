@@ -8,12 +8,13 @@ import pytest
 import xarray
 
 from perfcontrol import results
+from perfcontrol._files import written_whole
 
 
 def test_written_whole_leaves_the_old_file_when_the_block_fails(tmp_path: Path) -> None:
     target = tmp_path / "table.txt"
     target.write_text("old")
-    with pytest.raises(RuntimeError), results.written_whole(target) as temporary:
+    with pytest.raises(RuntimeError), written_whole(target) as temporary:
         temporary.write_text("half")
         raise RuntimeError
     assert target.read_text() == "old"
@@ -37,7 +38,7 @@ def test_save_json_refuses_non_finite_numbers_and_writes_nothing(tmp_path: Path)
 
 def test_full_disk_is_reported_with_the_file_that_was_meant(tmp_path: Path) -> None:
     target = tmp_path / "table.txt"
-    with pytest.raises(OSError) as caught, results.written_whole(target):
+    with pytest.raises(OSError) as caught, written_whole(target):
         raise OSError(28, "No space left on device")  # as `write` raises it: without a name
     assert caught.value.filename == str(target)
     assert list(tmp_path.iterdir()) == []

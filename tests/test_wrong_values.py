@@ -28,7 +28,21 @@ def drawn(key, M):
     return jax.numpy.zeros((3, 2, 2))
 
 
+def controlled(gate=False, gradient=None, **changes):
+    return pc.online.Controller(build(**changes), pc.RSGD(3, 0.1, gradient=gradient), gate=gate)
+
+
+def observed(steps, jump=0.0):
+    """The state after so many steps, one more observed a jump away from where they led."""
+    state = begun
+    for _ in range(steps):
+        state = plant.observe(state, *3 * [np.zeros(2)])
+    return plant.observe(state, np.full(2, jump), *2 * [np.zeros(2)]) if jump else state
+
+
 problem = build()
+plant = controlled()
+begun = plant.init()
 DATA = np.zeros((2, 4, 2)), np.zeros((2, 4, 2)), np.zeros((2, 1, 2, 2))  # states, inputs, deployed policies
 
 WRONG = {
@@ -243,6 +257,41 @@ WRONG = {
             "M[None]",
         ),
         "step of no kind": (lambda: pc.theorem_step_size(problem, kind="best"), "kind", "'best'"),
+    },
+    "plant": {
+        "another method": (lambda: pc.online.Controller(problem, pc.StablePoint()), "solver", "init(M0=M)"),
+        "a gradient of no plant": (lambda: controlled(gradient=pc.Exact()), "solver", "pc.Pathwise()"),
+        "gate by name": (lambda: controlled("on"), "gate", "pc.online.Gate()"),
+        "gate without parentheses": (lambda: controlled(pc.online.Gate), "gate", "pc.online.Gate()"),
+        "no cost at all": (lambda: pc.online.Gate(cost=0.0), "cost", "positive"),
+        "infinite radius": (lambda: pc.online.Gate(radius=inf), "radius", "None"),
+        "radius as a switch": (lambda: pc.online.Gate(radius=True), "radius", "got True"),
+        "step as a number": (lambda: pc.online.Gate(step=0.1), "step", "False"),
+        "certificate by name": (lambda: pc.online.Gate(certificate="sharp"), "certificate", "'sharp'"),
+        "start without lags": (lambda: plant.init(np.zeros((2, 2))), "M0", "M[None]"),
+        "start outside": (lambda: controlled(feasible_set=pc.FrobeniusBall(1.0)).init(9 + M), "M0", "project"),
+        "key as a seed": (lambda: plant.init(key=3), "key", "jax.random.key(3)"),
+        "no state": (lambda: plant.act(None, np.zeros(2)), "state", "controller.init()"),
+        "state of another size": (lambda: plant.act(begun, np.zeros(3)), "x", "(3,)"),
+        "state not a number": (lambda: plant.act(begun, [nan, 0.0]), "x", "nan at index [0]"),
+        "input of another size": (lambda: plant.observe(begun, M[0, 0], np.zeros(3), M[0, 0]), "u", "(3,)"),
+        "infinite input": (lambda: plant.observe(begun, M[0, 0], [0.0, inf], M[0, 0]), "u", "inf"),
+        "next state missing": (lambda: plant.observe(begun, M[0, 0], M[0, 0], None), "x_next", "got None"),
+        "matrix as a vector": (lambda: plant.observe(begun, M[0, 0], M[0, 0], M[0, 0], M[0, 0]), "A", "(2, 2)"),
+        "matrix not a number": (lambda: plant.observe(begun, *3 * [M[0, 0]], nan * eye), "A", "nan"),
+        "step left out": (lambda: observed(1, 5.0), "x", "last x_next"),
+        "step too many": (lambda: observed(4), "state", "end_episode"),
+        "episode too short": (lambda: plant.end_episode(observed(2)), "state", "2 observed steps"),
+        "state begun without a gate": (
+            lambda: controlled(pc.online.Gate(step=False)).end_episode(observed(3)),
+            "state",
+            "this controller's init",
+        ),
+        "nothing expected": (
+            lambda: controlled(False, perturbation=pc.SampledPerturbation(drawn)).observe(begun, *3 * [M[0, 0]]),
+            "A",
+            "SampledPerturbation",
+        ),
     },
     "data": {
         "numbers": (lambda: pc.Logs(1, 2, 3), "x", "(episode, time, state)"),

@@ -1,6 +1,7 @@
 """Every public name, as `import perfcontrol as pc` offers them."""
 
 import perfcontrol.experiments as experiments
+import perfcontrol.online as online
 from perfcontrol._cache import cache
 from perfcontrol._calls import explain_calls
 from perfcontrol._checks import InputError
@@ -205,6 +206,7 @@ __all__ = [
     "expected_gradient",
     "experiments",
     "fit",
+    "online",
     "path_gradient",
     "price_of_stability",
     "recover_noise",

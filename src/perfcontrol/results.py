@@ -3,51 +3,21 @@
 import importlib.metadata
 import io
 import json
-import os
 import platform
 import tempfile
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import xarray
 
-
-@contextmanager
-def written_whole(path: Path) -> Iterator[Path]:
-    """A temporary path beside `path` that takes its place when the block ends well, and vanishes otherwise.
-
-    An OSError names `path`, or the file in its way, and never the temporary one.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with _naming(path):
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}.", suffix=path.suffix)
-        os.close(handle)
-        temporary = Path(name)
-        try:
-            yield temporary
-            # mkstemp makes files private; results are for everyone whom the folder is for
-            temporary.chmod(0o644)
-            os.replace(temporary, path)
-        finally:
-            temporary.unlink(missing_ok=True)
-
-
-@contextmanager
-def _naming(path: Path) -> Iterator[None]:
-    """Errors of the operating system inside are about `path`; a full disk says of itself not even which file."""
-    try:
-        yield
-    except OSError as error:
-        error.filename, error.filename2 = str(path), None
-        raise
+from perfcontrol._files import naming, written_whole
 
 
 def check_writable(folder: Path) -> None:
     """Make the folder and write in it, so that OSError comes before the work and not after it."""
     folder.mkdir(parents=True, exist_ok=True)
-    with _naming(folder), tempfile.TemporaryFile(dir=folder) as probe:
+    with naming(folder), tempfile.TemporaryFile(dir=folder) as probe:
         probe.write(b"probe")
 
 

@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
-from perfcontrol.results import written_whole
+from perfcontrol._files import written_whole
 
 ORDER_COLOURS = {"ascending": "#0072B2", "random": "#E69F00", "descending": "#C0392B"}
 ORDER_MARKS = {"ascending": "o", "random": "s", "descending": "^"}
