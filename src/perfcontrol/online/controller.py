@@ -79,11 +79,12 @@ class Controller:
             InputError: a policy of the wrong shape, outside the feasible set, or (with a gate) of unbounded cost.
         """
         problem = self.problem
-        M0 = np.asarray(problem.initial_policy() if M0 is None else problem.check_policy("M0", M0))
-        check_feasible("M0", problem, M0)
+        first = problem.initial_policy() if M0 is None else problem.check_policy("M0", M0)
+        check_feasible("M0", problem, first)
+        M0 = np.asarray(first)
         key = None if key is None else check_key(key)
         limits = None if self.gate is None else self.gate.limits(problem, self.solver, M0, key)
-        learner = jax.tree.map(np.asarray, self.solver.init(problem, jnp.asarray(M0)))
+        learner = jax.tree.map(np.asarray, self.solver.init(problem, first))
         progress = first_progress(self._finite, self.solver.batch)
         return ControllerState(M0, learner, progress, np.zeros((), int), limits, ())
 
