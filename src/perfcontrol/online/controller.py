@@ -1,5 +1,7 @@
 """The controller of a running plant: it acts, observes, learns between episodes, and deploys what its gate allows."""
 
+import functools
+import os
 from typing import Any
 
 import equinox as eqx
@@ -8,11 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from perfcontrol._checks import as_array, check_key, check_shape, fail
+from perfcontrol._fingerprint import fingerprint
 from perfcontrol._programs import Numbers, known
+from perfcontrol.online import files
 from perfcontrol.online.gate import as_gate
 from perfcontrol.online.learning import check_solver, iterate, learn, taken_back
 from perfcontrol.online.observing import act, costs, observe
-from perfcontrol.online.state import LOGGED, ControllerState, Entry, Progress, check_state, first_progress
+from perfcontrol.online.state import LOGGED, ControllerState, Entry, Limits, Progress, check_state, first_progress
 from perfcontrol.problem import PerformativeProblem, check_problem
 from perfcontrol.solvers import RSGD, Result
 from perfcontrol.solvers.base import State
@@ -84,9 +88,12 @@ class Controller:
         M0 = np.asarray(first)
         key = None if key is None else check_key(key)
         limits = None if self.gate is None else self.gate.limits(problem, self.solver, M0, key)
-        learner = jax.tree.map(np.asarray, self.solver.init(problem, first))
+        return self._first(first, limits)
+
+    def _first(self, M0: Any, limits: Limits | None) -> ControllerState:
+        learner = jax.tree.map(np.asarray, self.solver.init(self.problem, M0))
         progress = first_progress(self._finite, self.solver.batch)
-        return ControllerState(M0, learner, progress, np.zeros((), int), limits, ())
+        return ControllerState(np.asarray(M0), learner, progress, np.zeros((), int), limits, ())
 
     def act(self, state: ControllerState, x: Any) -> Numbers:
         """u_t, (m,).
@@ -157,6 +164,34 @@ class Controller:
         entry = Entry(int(state.episode), new, reason, cost if np.isfinite(cost) else None)
         log = (*state.log, entry)[-LOGGED:]
         return ControllerState(np.asarray(deployed), learner, following, state.episode + 1, state.limits, log)
+
+    def save(self, state: ControllerState, path: str | os.PathLike[str]) -> None:
+        """Write the state to one file: whole or not at all, and on the disk when this returns.
+
+        Args:
+            state: the state, at any time of an episode.
+            path: of the file; what is there is replaced.
+
+        Raises:
+            InputError: a state with numbers that are not finite.
+            OSError: the file cannot be written.
+        """
+        files.save(check_state(state), path, self._owner)
+
+    def restore(self, path: str | os.PathLike[str]) -> ControllerState:
+        """The state that `save` wrote, bit for bit, in this process or another one.
+
+        Args:
+            path: of the file.
+
+        Raises:
+            InputError: no such file; one of another problem, solver or gate, or precision; numbers that are not finite.
+        """
+        return files.restore(self._first(self.problem.initial_policy(), None), path, self._owner)
+
+    @functools.cached_property
+    def _owner(self) -> dict[str, str]:
+        return {name: fingerprint(getattr(self, name)) for name in ("problem", "solver", "gate")}
 
     def _learnt(self, state: ControllerState) -> tuple[Any, Numbers, bool, str]:
         """Learner, deployed policy, whether it is a new one, and why."""
