@@ -20,13 +20,20 @@ def test_snippet_runs_as_printed(snippet: str) -> None:
 
 
 def test_readme_example_finds_the_stable_policy() -> None:
-    block = re.findall(r"^```python\n(.*?)^```", PAGES[0].read_text("utf-8"), re.M | re.S)[0]
+    text = PAGES[0].read_text("utf-8")
+    block = re.findall(r"^```python\n(.*?)^```", text, re.M | re.S)[0]
     names: dict = {}
     exec(compile(block, "README.md", "exec"), names)
     pc, problem, stable = names["pc"], names["problem"], names["stable"]
     assert float(pc.residual(problem, stable.M)) < 1e-11
     start = float(((problem.initial_policy() - stable.M) ** 2).sum())
     assert float(((names["sampled"].M - stable.M) ** 2).sum()) < 0.05 * start
+    price = pc.price_of_stability(problem)
+    printed = [
+        float(number) for number in re.search(r"costs here: (\S+), against (\S+) for .*? and (\S+) for", text).groups()
+    ]
+    found = [price.cost_stable, price.cost_optimal, price.cost_naive]
+    assert [round(cost, 1) for cost in found] == printed
 
 
 def test_readme_links_lead_to_files() -> None:

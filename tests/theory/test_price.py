@@ -62,7 +62,7 @@ def test_price_is_that_of_the_published_closed_forms(case):
 def test_paragraph_says_which_policy_is_cheaper_and_what_foresight_saves():
     saves = pc.price_of_stability(performative_optima.pricing(3.0, 0.8)[0], starts=4)
     assert saves.cost_naive > saves.cost_stable
-    for words in ("more than the stable one: retraining lowers the cost", "not proved", f"{saves.ratio:.4g}"):
+    for words in ("more than the stable one: retraining lowers the cost", "not proved", "price of stability is 1.23"):
         assert words in str(saves)
     harms = pc.price_of_stability(performative_optima.location(10.0, 0.4, 0.5)[0], starts=4)
     assert harms.cost_naive < harms.cost_stable

@@ -1,5 +1,6 @@
-"""Figures, as PNG and SVG: of the paper's experiment, and of the theory for a problem of one's own."""
+"""Figures: of the paper's experiment, of the theory for a problem of one's own, of its landscape."""
 
+from perfcontrol.plotting.landscape_figure import figure_landscape
 from perfcontrol.plotting.theory_figures import figure_envelope, figure_error_bounds
 
-__all__ = ["figure_envelope", "figure_error_bounds"]
+__all__ = ["figure_envelope", "figure_error_bounds", "figure_landscape"]

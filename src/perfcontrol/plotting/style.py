@@ -5,9 +5,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -24,8 +21,7 @@ REGIME_TITLES = {
 }
 
 _STYLE: Any = {
-    "font.family": "serif",
-    "font.serif": ["STIX Two Text", "STIXGeneral", "DejaVu Serif"],
+    "font.family": ["STIXGeneral", "DejaVu Serif"],  # by name: figures saved outside `styled` keep it
     "mathtext.fontset": "stix",
     "font.size": 9,
     "axes.titlesize": 9.5,

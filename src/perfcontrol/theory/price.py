@@ -77,7 +77,7 @@ class PriceOfStability:
         stable = f"Retraining comes to rest at a stable policy{tie} that costs {self.cost_stable:.6g} in its own world"
         if _same(self.cost_stable, self.cost_optimal):
             return f"{stable}. No cheaper policy is known: foresight would save nothing."
-        price = "" if self.ratio is None else f": the price of stability is {self.ratio:.4g}"
+        price = "" if self.ratio is None else f": the price of stability is {in_figures(self.ratio)}"
         return (
             f"{stable}; the best policy found costs {self.cost_optimal:.6g}{price}. Foreseeing the reaction would save "
             f"{self.excess_stable:.4g}, {100 * self.excess_stable / self.cost_stable:.3g} % of the stable cost."
@@ -100,6 +100,12 @@ class PriceOfStability:
         if self.residual > STATIONARY:
             ended = f" The search for it had not ended: the residual of the total gradient is {self.residual:.1e}."
         return f"That no policy is cheaper still is not proved.{ended}"
+
+
+def in_figures(ratio: float) -> str:
+    """A ratio with at least two figures of what it has above one."""
+    above = ratio - 1
+    return f"{ratio:.{3 if above <= 0 or above >= 0.1 else int(2 - np.floor(np.log10(above)))}g}"
 
 
 def _same(a: float, b: float) -> bool:
