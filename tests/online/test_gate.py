@@ -74,7 +74,7 @@ def test_policy_passes_where_its_world_is_mean_square_stable_or_no_worse_than_th
     problem = volatile()
     gate, solver = pc.online.Gate(**OFF | {"radius": 1.0}), pc.RSGD(10, 0.1)
     candidate = np.asarray(size * normal(1, 1, 2, 2) / np.linalg.norm(normal(1, 1, 2, 2)))
-    limits = gate.limits(problem, solver, 0 * candidate, None)
+    limits = gate.limits(problem, solver, 0 * candidate)
     radius = radius_of(problem, candidate)
     reasons = gate.refuses(problem, limits, candidate, 0 * candidate, 0.1)
     assert bool(reasons) == (radius >= 1) == (size > 1)
@@ -93,10 +93,7 @@ def test_radius_is_not_asked_for_where_the_model_varies_in_time():
     )
     gate = pc.online.Gate(**OFF | {"radius": 1e-9})
     M = np.zeros((1, 2, 2))
-    assert (
-        endless(varying) is None
-        and gate.refuses(varying, gate.limits(varying, pc.RSGD(1, 0.1), M, None), M, M, 0.1) == []
-    )
+    assert endless(varying) is None and gate.refuses(varying, gate.limits(varying, pc.RSGD(1, 0.1), M), M, M, 0.1) == []
 
 
 def test_predicted_cost_may_grow_by_the_factor_of_the_gate_and_no_more():
@@ -106,7 +103,7 @@ def test_predicted_cost_may_grow_by_the_factor_of_the_gate_and_no_more():
     assert factor > 1.5
     for cost, passes in ((1.001 * factor, True), (0.999 * factor, False)):
         gate = pc.online.Gate(**OFF | {"cost": cost})
-        reasons = gate.refuses(problem, gate.limits(problem, solver, nothing, None), candidate, nothing, 0.1)
+        reasons = gate.refuses(problem, gate.limits(problem, solver, nothing), candidate, nothing, 0.1)
         assert (not reasons) == passes
     assert "predicted cost" in reasons[0] and f"{float(pc.expected_cost(problem, candidate)):.4g}" in reasons[0]
 

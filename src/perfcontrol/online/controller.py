@@ -77,7 +77,8 @@ class Controller:
 
         Args:
             M0: the policy to begin with, free parameters; None for the feasible one nearest to zero.
-            key: JAX random key of the gate's samples, on which the safe step rests; a fixed one if None.
+            key: JAX random key, as solvers take it; checked and not used, for a plant draws by itself. The samples of
+                the gate are those of `pc.safe_step` when it is given no key.
 
         Raises:
             InputError: a policy of the wrong shape, outside the feasible set, or (with a gate) of unbounded cost.
@@ -86,8 +87,9 @@ class Controller:
         first = problem.initial_policy() if M0 is None else problem.check_policy("M0", M0)
         check_feasible("M0", problem, first)
         M0 = np.asarray(first)
-        key = None if key is None else check_key(key)
-        limits = None if self.gate is None else self.gate.limits(problem, self.solver, M0, key)
+        if key is not None:
+            check_key(key)
+        limits = None if self.gate is None else self.gate.limits(problem, self.solver, M0)
         return self._first(first, limits)
 
     def _first(self, M0: Any, limits: Limits | None) -> ControllerState:

@@ -72,7 +72,7 @@ class Gate:
             remedy = "Pass gate=pc.online.Gate(step=False)."
             raise fail("gate", "a solver whose steps are transformed", "know how long a step may be", remedy)
 
-    def limits(self, problem: PerformativeProblem, solver: RSGD, M0: Numbers, key: Any) -> Limits:
+    def limits(self, problem: PerformativeProblem, solver: RSGD, M0: Numbers) -> Limits:
         """Settled once, for the model: the certificate and the safe step are costly.
 
         Raises:
@@ -94,7 +94,7 @@ class Gate:
         step = None
         if self.step and refusal is None:
             try:
-                step = min(float(safe_step(finite, solver.batch, key=key)) / weight, float(np.finfo(float).max))
+                step = min(float(safe_step(finite, solver.batch)) / weight, float(np.finfo(float).max))
             except InputError as error:
                 step, refusal = 0.0, f"no step is known to be safe: {error}"
         return Limits(cost, step, refusal)
