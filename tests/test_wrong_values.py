@@ -250,6 +250,8 @@ WRONG = {
         "unknown method": (lambda: pc.estimate_sensitivity(problem, method="magic"), "method", "'magic'"),
         "negative distance": (lambda: pc.rrm_error_bound(problem, -1.0, 5), "initial_error", "distance"),
         "half a step": (lambda: pc.rsgd_error_bound(problem, 0.1, 1.0, 2.5), "steps", "integer"),
+        "no gap": (lambda: pc.optimality_bound(problem, gap=0.0), "gap", "gap=1e-3"),
+        "no cells": (lambda: pc.optimality_bound(problem, max_cells=0), "max_cells", "at least 1"),
         "price from no start": (lambda: pc.price_of_stability(problem, starts=0), "starts", "at least 1"),
         "policy before of another shape": (
             lambda: pc.price_of_stability(problem, deployed_before=np.zeros((2, 2))),
@@ -319,6 +321,7 @@ GIVEN_BACK = {
     "ConfidenceRegion",
     "Estimate",
     "Fit",
+    "OptimalityBound",
     "PriceOfStability",
     "ReactionTest",
     "Solution",

@@ -16,6 +16,7 @@ from perfcontrol.theory.certificates.rigorous import Rigorous
 from perfcontrol.theory.certificates.sharp import Sharp
 from perfcontrol.theory.derivatives import hessian
 from perfcontrol.theory.existence import Existence, existence
+from perfcontrol.theory.optimality import OptimalityBound, optimality_bound
 from perfcontrol.theory.price import PriceOfStability, price_of_stability
 from perfcontrol.theory.rates.error_bounds import rrm_error_bound, rsgd_error_bound
 from perfcontrol.theory.rates.orders import OrderVerdict, compare_orders, order_by_bound
@@ -41,6 +42,7 @@ __all__ = [
     "Existence",
     "GlobalBound",
     "MeanSquareStability",
+    "OptimalityBound",
     "OrderVerdict",
     "Paper",
     "PriceOfStability",
@@ -61,6 +63,7 @@ __all__ = [
     "existence",
     "hessian",
     "mean_square_stability",
+    "optimality_bound",
     "order_by_bound",
     "price_of_stability",
     "reaction_jacobian",

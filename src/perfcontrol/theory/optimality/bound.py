@@ -1,0 +1,162 @@
+"""A proved interval for the optimal cost: how good the performative optimum can be at best.
+
+C_T(M; M) = 𝒞(M, θ(M)) with θ = σ², and 𝒞 is convex in M and increases in every θ_{tk}. On a cell of the few scalars
+that θ depends on, 𝒞(M, θ⁻) at the cell's least variances bounds it from below, and its minimum is a convex problem.
+
+References: docs: theory, "The performative optimum", Theorem 10.
+"""
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import numpy as np
+
+from perfcontrol._checks import check_integer, fail
+from perfcontrol.evaluate import expected_cost
+from perfcontrol.perturbations import DirectionalPerturbation, NoPerturbation
+from perfcontrol.problem import PerformativeProblem, check_problem
+from perfcontrol.solvers.optimum import PerformativeOptimum
+from perfcontrol.solvers.solve import solve
+from perfcontrol.theory.assumptions import Assumption, Status, weakest, word_of
+from perfcontrol.theory.certificates.ingredients import FIXED_NOISE
+from perfcontrol.theory.certificates.quadratic_form import expansion
+from perfcontrol.theory.derivatives import obstacles
+from perfcontrol.theory.existence import constant_mean
+from perfcontrol.theory.optimality.recognise import scalars_of
+from perfcontrol.theory.optimality.relaxation import relaxation_of
+from perfcontrol.theory.optimality.search import Search, Share
+from perfcontrol.theory.precision import in_double
+
+LEAST_GAP = 1e-9  # rounding of costs and of minimisers leaves no smaller one provable
+
+
+@dataclass(frozen=True)
+class OptimalityBound:
+    """lower ≤ min over the feasible set of C_T(M; M) ≤ upper, a proof up to rounding in double precision.
+
+    Attributes:
+        applicable: whether the problem has the form that the proof needs.
+        missing: what to change where it has not; numbers are None then.
+        lower: no policy costs less.
+        upper: the cost of `M`.
+        M: the cheapest policy known, policy_shape.
+        gap: (upper - lower)/|upper|.
+        closed: whether that is as small as was asked for.
+        cells: how many cells were bounded.
+        assumptions: what the proof rests on.
+    """
+
+    applicable: bool
+    missing: tuple[str, ...] = ()
+    lower: float | None = None
+    upper: float | None = None
+    M: np.ndarray | None = None
+    gap: float | None = None
+    closed: bool = False
+    cells: int = 0
+    assumptions: tuple[Assumption, ...] = ()
+
+    @property
+    def status(self) -> Status:
+        """How the interval is known: "proved", or "declared" where it rests on the user's word."""
+        return weakest(self.assumptions)
+
+    def __str__(self) -> str:
+        if not self.applicable:
+            return "The optimal cost is not bounded from below: " + "; ".join(self.missing) + "."
+        return (
+            f"The optimal cost lies between {self.lower:.6g} and {self.upper:.6g} ({self.status}): no policy is "
+            f"cheaper than the best one found by more than {100 * (self.gap or 0):.2g} %. Cells bounded: {self.cells}."
+        )
+
+
+@in_double
+def optimality_bound(problem: PerformativeProblem, gap: float = 1e-3, max_cells: int = 2000) -> OptimalityBound:
+    """Bound the optimal cost min C_T(M; M) from below and above, by branch and bound to global optimality.
+
+    For quadratic costs and perturbations along fixed directions whose mean does not react along the feasible set, with
+    scales that are constant, `Affine` of rank up to three, a `Norm`, or a `Function(f, convex=True)` of values (k,).
+
+    Args:
+        problem: a finite horizon.
+        gap: relative width (upper - lower)/|upper| at which to stop.
+        max_cells: at most so many cells; what is proved by then is returned.
+
+    Returns:
+        An `OptimalityBound`.
+
+    Raises:
+        InputError: a gap below what rounding allows, or no cells.
+
+    References:
+        docs: theory, "The performative optimum", Theorem 10.
+    """
+    if not isinstance(gap, int | float | np.number) or not LEAST_GAP <= gap < np.inf:
+        raise fail("gap", repr(gap), f"be a number, at least {LEAST_GAP:g}", "Pass gap=1e-3 for a tenth of a per cent.")
+    max_cells = check_integer("max_cells", max_cells, 1)
+    check_problem(problem)
+    missing = _missing(problem)
+    if missing:
+        return OptimalityBound(False, tuple(missing))
+    shares = _shares(problem)
+    if isinstance(shares, str):
+        return OptimalityBound(False, (shares,))
+    best = np.asarray(solve(problem, PerformativeOptimum(), throw=False).M, dtype=float).reshape(-1)
+    searches = [Search(share, best) for share in shares]
+
+    def ends() -> tuple[float, float]:
+        return sum(search.lower for search in searches), sum(search.upper for search in searches)
+
+    while sum(search.cells for search in searches) < max_cells:
+        lower, upper = ends()
+        if upper - lower <= gap * abs(upper):
+            break
+        max(searches, key=lambda search: search.gap).refine()
+    lower, upper = ends()
+    width = (upper - lower) / abs(upper) if upper else 0.0
+    cells, M = sum(search.cells for search in searches), searches[0].M.reshape(problem.policy_shape)
+    return OptimalityBound(True, (), lower, upper, M, width, width <= gap, cells, _assumptions(problem))
+
+
+def _missing(problem: PerformativeProblem) -> list[str]:
+    if not problem.is_finite:
+        return ["the horizon is infinite: bound problem.truncated(200), or another finite horizon"]
+    missing = obstacles(problem)
+    law = problem.perturbation
+    if not isinstance(law, DirectionalPerturbation | NoPerturbation):
+        wanted = "perturbation=pc.DirectionalPerturbation(directions, pc.Norm(offset, weight))"
+        missing.append(f"the perturbations are not of fixed directions: pass {wanted}")
+    elif not constant_mean(problem):
+        missing.append("the mean of the perturbations depends on the policy: pass mean=None")
+    if problem.noise_reacts:
+        missing.append(FIXED_NOISE)
+    return missing
+
+
+def _shares(problem: PerformativeProblem) -> list[Share] | str:
+    if isinstance(problem.perturbation, NoPerturbation):
+        still = DirectionalPerturbation(np.eye(problem.state_size)[None], np.zeros(1))
+        problem = eqx.tree_at(lambda p: p.perturbation, problem, still)
+    scalars = scalars_of(problem)
+    if isinstance(scalars, str):
+        return scalars
+    shape = problem.policy_shape
+
+    def value(M: np.ndarray) -> float:
+        return float(expected_cost(problem, M.reshape(shape)))
+
+    def improve(M: np.ndarray) -> np.ndarray:
+        found = np.asarray(solve(problem, PerformativeOptimum(), M.reshape(shape), throw=False).M, dtype=float)
+        return found.reshape(-1) if value(found) < value(M) else M
+
+    return [Share(scalars, lambda variances: expansion(problem, variances), relaxation_of(problem), value, improve)]
+
+
+def _assumptions(problem: PerformativeProblem) -> tuple[Assumption, ...]:
+    declared = getattr(getattr(problem.perturbation, "scale", None), "declared_convex", None)
+    word = (
+        Assumption("the sublevel sets of the scales are convex", "declared"),
+        Assumption("the least sizes of the scales are those that descent found", "estimated"),
+    )
+    word = word if declared else ()
+    return (Assumption("the lower bound of every cell", "proved"), *word, *word_of(problem))
