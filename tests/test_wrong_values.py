@@ -173,6 +173,7 @@ WRONG = {
         "never deployed": (lambda: pc.Lazy(0), "steps", "at least 1"),
         "no delay": (lambda: pc.InverseStep(1.0, 0.0), "phi2", "positive"),
         "step that falls too fast": (lambda: pc.PowerStep(0.1, 1.5), "alpha", "pc.InverseStep"),
+        "falls before it starts": (lambda: pc.PowerStep(0.1, delay=-1.0), "delay", "positive"),
         "all burnt in": (lambda: pc.Average(burn_in=1.0), "burn_in", "0.25"),
         "points that coincide": (lambda: pc.TwoPoint(0.0), "radius", "0.1"),
         "negative ridge": (lambda: pc.EstimatedDynamics(-1.0), "ridge", "1e-6"),

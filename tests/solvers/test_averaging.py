@@ -24,9 +24,9 @@ class TestAveragedRSGD(SolverContract):
         return pc.RSGD(12, pc.PowerStep(0.01, 0.6), average=True)
 
 
-def mapped(problem, solver, seeds):
+def mapped(problem, solver, seeds, M0=None):
     """Solutions of so many seeds, with a leading axis; the history holds start and end alone."""
-    run = jax.jit(jax.vmap(lambda key: pc.solve(problem, solver, key=key, every=solver.steps)))
+    run = jax.jit(jax.vmap(lambda key: pc.solve(problem, solver, M0, key=key, every=solver.steps)))
     return jax.tree.map(np.asarray, run(jax.random.split(KEY, seeds)))
 
 
@@ -90,6 +90,8 @@ def test_covariance_of_a_short_run_matches_the_dense_sum_over_its_noise():
     gradients = (plain[:-1] - plain[1:]) / etas
     variance = np.mean(gradients[first:] ** 2)
     assert_close(solution.stats["covariance"], [[variance * np.sum(np.square(weights))]], 1e-10)
+    left = np.cumprod(1 - slope * etas)[first:].mean()  # of the start
+    assert_close(solution.stats["start_offset"], left * (20.0 - solution.M), 1e-10)
 
 
 def test_covariance_by_batch_means_matches_the_batches_written_out():
@@ -147,7 +149,9 @@ def static_runs():
 
 def coverage(solutions, stable, level=0.95):
     count = len(solutions.M)
-    return np.mean([pc.confidence_region(one(solutions, i), level).contains(stable) for i in range(count)])
+    share = np.mean([pc.confidence_region(one(solutions, i), level).contains(stable) for i in range(count)])
+    print(f"region of level {level} covers in {share:.1%} of {count} runs")
+    return share
 
 
 def test_region_covers_the_stable_policy_of_the_static_check_as_often_as_it_says(static_runs):
@@ -165,6 +169,32 @@ def test_region_covers_the_stable_policy_of_a_control_problem_as_often_as_it_say
         for r in (pc.confidence_region(one(solutions, i)) for i in range(1000))
     ]
     assert np.all(np.abs(np.mean(inside, axis=0) - 0.95) <= 0.03)
+
+
+FAR = jnp.asarray([[[2.0, 0.0], [2.0, 0.0]]])  # along the direction that is slow to come back
+
+
+@pytest.mark.slow
+def test_region_covers_the_stable_policy_from_a_start_that_the_run_forgets():
+    solver = pc.RSGD(3000, pc.PowerStep(0.5, 0.6, delay=20.0), average=True)
+    assert 0.92 <= coverage(mapped(swapped(0.9), solver, 1000, FAR), np.zeros((1, 2, 2))) <= 0.98
+
+
+@pytest.mark.slow
+def test_region_covers_the_stable_policy_of_a_control_problem_with_twelve_parameters():
+    problem = drifting(0)
+    stable = pc.solve(problem, pc.StablePoint()).M
+    solver = pc.RSGD(4000, pc.PowerStep(8e-4, 0.6, delay=230.0), average=True)
+    assert 0.92 <= coverage(mapped(problem, solver, 1000), stable) <= 0.98
+
+
+def test_offset_of_the_start_is_the_mean_error_and_refused_where_it_matters():
+    solver = pc.RSGD(800, pc.PowerStep(1.0, 0.6), average=True)
+    run = pc.solve(swapped(0.9), solver, 2 * FAR, key=KEY)
+    assert_refused(lambda: pc.confidence_region(run), "solution", "feels its start", "delay")
+    near = mapped(swapped(0.9), solver, 400, 1.5 * FAR)
+    offset, deviation = np.mean(near.stats["start_offset"], axis=0), np.std(near.M, axis=0)
+    assert_close(np.mean(near.M, axis=0)[0, :, 0], offset[0, :, 0], 4 * np.max(deviation) / 20 / np.max(offset))
 
 
 def test_region_is_the_ellipsoid_of_the_covariance(static_runs):
@@ -208,7 +238,8 @@ def test_region_is_refused_where_it_would_mislead():
     crawl = pc.RSGD(100, 1e-3, average=pc.Average(covariance="batch means"))
     crawling = pc.solve(performative_prediction(0.5), crawl, key=KEY)
     assert_refused(lambda: pc.confidence_region(crawling), "solution", "resemble")
-    assert_refused(lambda: pc.confidence_region(run).contains([0.0]), "M", "(1, 1, 1)")
+    near = pc.solve(performative_prediction(0.5), pc.RSGD(30, 0.1, average=True), [[[20.0]]], key=KEY)
+    assert_refused(lambda: pc.confidence_region(near).contains([0.0]), "M", "(1, 1, 1)")
 
 
 def test_average_refuses_settings_that_make_no_sense():
@@ -220,5 +251,6 @@ def test_average_refuses_settings_that_make_no_sense():
     few = pc.RSGD(40, 0.1, average=pc.Average(covariance="batch means"))
     assert_refused(lambda: pc.solve(performative_prediction(0.5), few, key=KEY), "steps", "44")
     assert_refused(lambda: pc.PowerStep(0.0), "eta", "positive")
+    assert_refused(lambda: pc.PowerStep(1.0, delay=0.0), "delay", "positive")
     for alpha in (0.5, 1.0):
         assert_refused(lambda alpha=alpha: pc.PowerStep(1.0, alpha), "alpha", "between 1/2 and 1")

@@ -1,4 +1,4 @@
-"""Gradients that see less than the paper's: costs alone, or states and inputs alone."""
+"""Gradients that see less than the paper's: costs alone, or states, inputs and noise without the perturbations."""
 
 import jax
 import jax.numpy as jnp
@@ -111,43 +111,36 @@ def test_estimated_dynamics_gradient_matches_regression_and_differences_in_numpy
     gradient = pc.EstimatedDynamics(ridge=0.0)(problem, M, DEPLOYED, KEY, batch)
     paths = jax.tree.map(np.asarray, pc.simulate(problem, M, deployed=DEPLOYED, key=KEY, samples=batch))
     A, B, K = (np.asarray(a) for a in (problem.system.A, problem.system.B, problem.gain))
-    left = paths.x[:, 1:] - paths.x[:, :-1] @ A.T - paths.u[:, :-1] @ B.T
+    moved = paths.x[:, 1:] - paths.x[:, :-1] @ A.T - paths.u[:, :-1] @ B.T - paths.w
     design = np.concatenate([paths.x[:, :-1], np.ones((batch, 6, 1))], axis=-1)
-    slope = np.linalg.lstsq(design.reshape(-1, 3), left.reshape(-1, 2), rcond=None)[0][:2].T
-    w = left - paths.x[:, :-1] @ slope.T
+    slope = np.linalg.lstsq(design.reshape(-1, 3), moved.reshape(-1, 2), rcond=None)[0][:2].T
 
     def cost(policy):
         total = 0.0
-        for x, u, noise in zip(paths.x, paths.u, w, strict=True):
-            v = u + x @ K.T  # what the policy added, kept; its change acts on the estimated noise
-            state = x[0]
+        for x, u, noise in zip(paths.x, paths.u, paths.w, strict=True):
+            away = np.zeros(2)  # from the path that was observed, under the estimated dynamics
             for t in range(7):
                 change = (policy - np.asarray(M))[0] @ (noise[t - 1] if t > 0 else np.zeros(2))
-                action = v[t] + change - K @ state
+                state, action = x[t] + away, u[t] + change - K @ away
                 total += state @ state + 0.2 * action @ action
-                if t < 6:
-                    state = (A + slope) @ state + B @ action + noise[t]
+                away = (A + slope) @ away + B @ (action - u[t])
         return total / batch
 
     assert_close(gradient, central_differences(cost, np.asarray(M), 0.1), 1e-9)
 
 
-def test_estimated_dynamics_bias_vanishes_without_scatter_as_episodes_grow():
+def test_estimated_dynamics_gradient_is_that_of_the_paths_where_perturbations_do_not_scatter():
     problem = quiet()
-    expected = pc.expected_gradient(problem, M, deployed=DEPLOYED)
-    few, many = (
-        np.asarray(estimates(pc.EstimatedDynamics(), problem, batch, count)) for batch, count in ((2, 4000), (256, 400))
-    )
-    bias = [np.linalg.norm(samples.mean(axis=0) - expected) / np.linalg.norm(expected) for samples in (few, many)]
-    assert bias[0] > 0.05 and bias[1] < 0.01, bias
+    estimated = pc.EstimatedDynamics(ridge=0.0)(problem, M, DEPLOYED, KEY, 2)
+    assert_close(estimated, pc.sample_gradient(problem, M, deployed=DEPLOYED, key=KEY, samples=2), 1e-9)
 
 
 def test_estimated_dynamics_keeps_a_bias_where_the_perturbation_scatters():
-    problem = quiet(jnp.asarray([1.0]))
+    problem = quiet(jnp.asarray([2.0]))
     expected = pc.expected_gradient(problem, M, deployed=DEPLOYED)
     samples = np.asarray(estimates(pc.EstimatedDynamics(), problem, 256, 400))
     gap = np.abs(samples.mean(axis=0) - expected)
-    assert np.any(gap > 5 * samples.std(axis=0) / 20) and np.linalg.norm(gap) > 0.02 * np.linalg.norm(expected)
+    assert np.any(gap > 5 * samples.std(axis=0) / 20) and np.linalg.norm(gap) > 0.1 * np.linalg.norm(expected)
 
 
 def test_estimated_dynamics_is_finite_where_states_do_not_vary():

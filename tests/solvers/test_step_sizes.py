@@ -23,6 +23,13 @@ def test_inverse_step_is_phi1_over_n_plus_phi2():
 
 
 @pytest.mark.float32
+def test_power_step_falls_from_the_start_or_after_its_delay():
+    n = np.arange(5)
+    assert_close(pc.PowerStep(0.5, 0.6)(STEPS), 0.5 * (n + 1.0) ** -0.6, single=1e-6)
+    assert_close(pc.PowerStep(0.5, 0.6, delay=20.0)(STEPS), 0.5 * 20**0.6 * (n + 20.0) ** -0.6, single=1e-6)
+
+
+@pytest.mark.float32
 def test_inverse_step_matches_the_published_schedule_counted_from_one():
     published = [published_step_size(t, 0.9) for t in range(1, 6)]
     assert_close(pc.InverseStep(10, 801)(STEPS), published, 1e-12, 1e-6)

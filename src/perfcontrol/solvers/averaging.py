@@ -27,6 +27,7 @@ COVARIANCES = ("sandwich", "batch means")
 class Tally(eqx.Module):
     """What a run carries: sums over the iterates since the burn-in."""
 
+    start: Numbers
     iterate: Numbers
     mean: Numbers  # of the iterates; the iterate itself before there is any
     count: Numbers
@@ -44,7 +45,8 @@ class Average(eqx.Module):
     `confidence_region` refuses r > 0.6.
 
     `.stats` of the run: `covariance`, `averaged` (iterates), `clipped` (averaged steps that a set which is
-    not affine cut short), `batches` (complete ones; 0 for the sandwich), `batch_correlation` (r).
+    not affine cut short), `start_offset` (policy_shape: what is left of the start in the average, to first order; with
+    the sandwich, else zero), `batches` (complete ones; 0 for the sandwich), `batch_correlation` (r).
 
     Args:
         burn_in: fraction of the steps left out at the start, in [0, 1).
@@ -97,7 +99,7 @@ class Average(eqx.Module):
         """Nothing averaged yet."""
         zero = jnp.zeros((), int)
         rows = M0.size if self.exact(problem) else batches(problem)
-        return Tally(M0, M0, zero, jnp.zeros((rows, M0.size), M0.dtype), zero)
+        return Tally(M0, M0, M0, zero, jnp.zeros((rows, M0.size), M0.dtype), zero)
 
     def add(
         self, problem: PerformativeProblem, tally: Tally, n: Array, steps: int, M: Array, gradient: Array, moved: Array
@@ -116,7 +118,7 @@ class Average(eqx.Module):
             # Rows past the last are dropped; before the burn-in nothing is added.
             spread = tally.spread.at[(n - first) // length].add(jnp.where(counts, M.reshape(-1), 0))
         cut = counts & (moved > 1e-6 * (1 + jnp.sqrt(jnp.sum(M**2)))) & (not problem.feasible_set.affine)
-        return Tally(M, mean, count, spread, tally.clipped + cut)
+        return Tally(tally.start, M, mean, count, spread, tally.clipped + cut)
 
     def statistics(
         self,
@@ -130,14 +132,16 @@ class Average(eqx.Module):
         """`covariance` (p, p) of the average, and what is needed to judge it; gradients are weight ∇_1 C."""
         first = self.first(steps)
         if self.exact(problem):
-            covariance = _sandwich(problem, weight, tally, step_size, first, sampled)
+            covariance, felt = _sandwich(problem, weight, tally, step_size, first, sampled)
             complete, correlation = jnp.zeros((), int), jnp.zeros((), covariance.dtype)
         else:
             covariance, complete, correlation = _batch_means(tally, (steps - first) // batches(problem))
+            felt = jnp.zeros_like(tally.mean)
         return {
             "covariance": covariance,
             "averaged": tally.count,
             "clipped": tally.clipped,
+            "start_offset": felt,
             "batches": complete,
             "batch_correlation": correlation,
         }
@@ -182,30 +186,32 @@ def mean_field_jacobian(problem: PerformativeProblem, M: Any) -> Array:
 @program(on_device=True)
 def _sandwich(
     problem: PerformativeProblem, weight: float, tally: Tally, step_size: Any, first: int, sampled: bool
-) -> Array:
-    """Covariance of the mean of e_{first+1}, ..., e_{first+count}; infinite where there is none."""
+) -> tuple[Array, Array]:
+    """Covariance of the mean of e_{first+1}, ..., e_{first+count}, infinite where there is none, and what it keeps of
+    the start."""
     J, size, dtype = weight * mean_field_jacobian(problem, tally.mean), tally.mean.size, tally.mean.dtype
-    count = tally.count
+    count, apart = tally.count, (tally.start - tally.mean).reshape(-1)
     V = tally.spread / jnp.maximum(count, 1) if sampled else jnp.zeros_like(tally.spread)
     if problem.feasible_set.affine:
         tangent = projection_slope(problem.feasible_set, tally.mean)
-        J, V = tangent @ J @ tangent, tangent @ V @ tangent
+        J, V, apart = tangent @ J @ tangent, tangent @ V @ tangent, tangent @ apart
     # Early steps may be too long for the linear picture; the projection, or chance, has kept the run together.
     longest = 2 / jnp.maximum(jnp.linalg.norm(J, 2), jnp.finfo(dtype).tiny)
 
-    def follow(n: Array, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        error, cross, total = carry  # E eeᵀ, E seᵀ, E ssᵀ with s the sum of the errors that count
+    def follow(n: Array, carry: Any) -> Any:
+        error, cross, total, left, felt = carry  # E eeᵀ, E seᵀ, E ssᵀ with s the sum of the errors that count; E e, E s
         eta = jnp.minimum(size_of(step_size, n).astype(dtype), longest)
         step = jnp.eye(size, dtype=dtype) - eta * J
         error = step @ error @ step.T + eta**2 * V
-        cross = cross @ step.T
+        cross, left = cross @ step.T, step @ left
         counts = (n >= first).astype(dtype)
         total = total + counts * (cross + cross.T + error)
-        return error, cross + counts * error, total
+        return error, cross + counts * error, total, left, felt + counts * left
 
-    zero = jnp.zeros((size, size), dtype)
-    _, _, total = jax.lax.fori_loop(0, first + count, follow, (zero, zero, zero))
-    return jnp.where(count > 0, total / jnp.maximum(count, 1) ** 2, jnp.inf * jnp.eye(size, dtype=dtype))
+    zero, none = jnp.zeros((size, size), dtype), jnp.zeros(size, dtype)
+    *_, total, _, felt = jax.lax.fori_loop(0, first + count, follow, (zero, zero, zero, apart, none))
+    covariance = jnp.where(count > 0, total / jnp.maximum(count, 1) ** 2, jnp.inf * jnp.eye(size, dtype=dtype))
+    return covariance, (felt / jnp.maximum(count, 1)).reshape(tally.mean.shape)
 
 
 @program(on_device=True)

@@ -12,6 +12,7 @@ from perfcontrol.solvers.base import Solution
 from perfcontrol.solvers.result import Result
 
 ALIKE = 0.6  # correlation of neighbouring batches from which on their scatter says too little
+MISSED = 1.5  # times as often as `level` says may the region miss because the start is still felt
 
 
 class ConfidenceRegion(eqx.Module):
@@ -56,7 +57,8 @@ def confidence_region(solution: Solution, level: float = 0.95) -> ConfidenceRegi
     """The region of an averaged run in which the stable policy lies with probability `level`, asymptotically.
 
     Chi-squared quantiles with the sandwich covariance, Hotelling's (and Student's) with batch means. It knows the
-    sampling error alone: a run too short to have forgotten its start is off by more.
+    sampling error alone. A run too short to have forgotten its start is off by more: with the sandwich, by so much that
+    a region would miss half again as often as `level` says, it is refused; with batch means nothing tells.
 
     Args:
         solution: of one `pc.RSGD(..., average=True)` run.
@@ -67,8 +69,8 @@ def confidence_region(solution: Solution, level: float = 0.95) -> ConfidenceRegi
 
     Raises:
         InputError: a solution without covariance or of several runs, a level outside (0, 1), batches too few or
-            too alike, a run that failed, an average at the border of a set that is not affine, where the error is
-            not normal.
+            too alike, a run that failed or still feels its start, an average at the border of a set that is not
+            affine, where the error is not normal.
 
     References:
         Cutler, Díaz and Drusvyatskiy (2022); docs: theory, "Averaged iterates".
@@ -114,6 +116,15 @@ def confidence_region(solution: Solution, level: float = 0.95) -> ConfidenceRegi
             "Take more or longer steps; where moments are known, covariance='sandwich' needs neither.",
         )
     radius, width = _quantiles(level, rank, batches)
+    along = vectors[:, keep].T @ np.asarray(stats["start_offset"], float).reshape(-1)
+    missing = 1 - float(scipy.special.chndtr(radius**2, rank, along @ (along / values[keep]))) if rank else 0.0
+    if missing > MISSED * (1 - level) and batches == 0:
+        raise fail(
+            "solution",
+            f"a run whose average still feels its start, so that the region would miss in {missing:.0%}",
+            f"miss in about {1 - level:.0%}",
+            "Take more or longer steps (pc.PowerStep(eta, delay=...)), a larger burn_in, or a better start.",
+        )
     centre = np.asarray(solution.M)
     half_axes = (radius * np.sqrt(values[keep]) * vectors[:, keep]).T[::-1].reshape(rank, *centre.shape)
     reach = width * np.sqrt(np.clip(np.diag(covariance), 0, None)).reshape(centre.shape)

@@ -1,4 +1,4 @@
-"""A gradient from states and inputs alone: the perturbed dynamics are estimated from the episodes that it uses."""
+"""A gradient from states, inputs and noise: the perturbations are estimated from the episodes that it uses."""
 
 from typing import Any
 
@@ -16,17 +16,16 @@ from perfcontrol.solvers.gradients import AbstractGradient
 
 
 class EstimatedDynamics(AbstractGradient):
-    """The path gradient where A_t + Δ_t is not observed, as Algorithm 1 has it, but only x and u are.
+    """The path gradient where A_t + Δ_t is not observed, as Algorithm 1 has it, but only x, u and the noise w are, on
+    which the policy acts.
 
-    Regresses x_{t+1} - A_t x_t - B_t u_t on z_t (x_t, or [x_t; u_t]), with an intercept, over all steps of the `batch`
-    episodes; takes the slope Θ̂ for every Δ_t and the rest, ŵ_t, for the noise; then goes back along each path as
-    `pc.Pathwise` does.
+    Regresses x_{t+1} - A_t x_t - B_t u_t - w_t = Δ_t z_t on z_t (x_t, or [x_t; u_t]), with an intercept, over all steps
+    of the `batch` episodes, takes the slope Θ̂ for every Δ_t, and goes back along each path as `pc.Pathwise` does.
 
-    What is lost: (1) how Δ_t scatters around its mean. The gradient is that of a world in which (Δ_t - EΔ_t) z_t is
-    noise which does not grow with the state, so that RSGD comes to rest elsewhere, the farther the larger that
-    variance. (2) how EΔ_t varies in time. (3) the regression error, which the noise shares: of order
-    n / (horizon · batch), severe for a single short episode. Only where the perturbation does not scatter, and for many
-    episodes, is it the gradient. docs: "Which method when" has the measured bias.
+    What is lost: (1) how Δ_t scatters around its mean: the cost-to-go lacks its part of 𝒞*, so that RSGD comes to rest
+    elsewhere, the farther the larger that variance. (2) how EΔ_t varies in time. (3) the regression error where Δ_t
+    scatters, of order n / (horizon · batch), severe for a single short episode. Where Δ_t neither scatters nor varies,
+    nothing is. docs: "Which method when" has the measured bias.
 
     Args:
         ridge: added to the regression's normal matrix, relative to its mean eigenvalue, so that states that do not
@@ -48,24 +47,22 @@ class EstimatedDynamics(AbstractGradient):
     ) -> Array:
         policy, reacting = problem.structure.lift(M), problem.structure.lift(deployed)
 
-        def observed(key: Array) -> tuple[Array, Array]:
+        def observed(key: Array) -> tuple[Array, Array, Array]:
             path = sample_path(problem, policy, reacting, key)
-            return path.x, path.u
+            return path.x, path.u, path.w
 
-        x, u = over_paths(problem, observed, key, batch)
-        z, unexplained = jax.vmap(lambda x, u: _unexplained(problem, x, u))(x, u)
-        slope = _slope(z, unexplained, self.ridge)
-        w = unexplained - z @ slope.T
+        x, u, w = over_paths(problem, observed, key, batch)
+        slope = _slope(*jax.vmap(lambda x, u, w: _moved(problem, x, u, w))(x, u, w), self.ridge)
         draws = DenseDraws(jnp.broadcast_to(slope, (problem.horizon, *slope.shape)))
         return jnp.mean(jax.vmap(lambda x, u, w: path_gradient(problem, Path(x, u, w, draws)))(x, u, w), axis=0)
 
 
-def _unexplained(problem: PerformativeProblem, x: Array, u: Array) -> tuple[Array, Array]:
-    """z_t (T, p) and x_{t+1} - A_t x_t - B_t u_t (T, n) of one episode."""
+def _moved(problem: PerformativeProblem, x: Array, u: Array, w: Array) -> tuple[Array, Array]:
+    """z_t (T, p) and x_{t+1} - A_t x_t - B_t u_t - w_t (T, n) of one episode."""
     n, m = problem.state_size, problem.input_size
     z = jnp.concatenate([x, u], axis=1)[:-1, : problem.perturbation.columns(n, m)]
     A = along_time(as_dense(problem.system.A), 2, problem.horizon)
-    return z, x[1:] - jnp.einsum("tij,tj->ti", A, x[:-1]) - input_term(problem.system.B, u)
+    return z, x[1:] - jnp.einsum("tij,tj->ti", A, x[:-1]) - input_term(problem.system.B, u) - w
 
 
 def _slope(z: Array, response: Array, ridge: Array) -> Array:

@@ -37,15 +37,21 @@ class InverseStep(eqx.Module):
 
 
 class PowerStep(eqx.Module):
-    """η_n = eta (n + 1)^{-alpha}: slower than 1/n, so that the average of the iterates is asymptotically efficient.
+    """η_n = eta (1 + n / delay)^{-alpha}: slower than 1/n, so that averages of iterates are asymptotically efficient.
+
+    The first `delay` steps or so keep their length; after that they fall. A start far off is forgotten sooner with a
+    delay of some 1 / (eta λ), λ the smallest eigenvalue of ∂g(M; M).
 
     Examples:
         >>> round(float(PowerStep(0.5, 0.75)(15)), 4)
+        0.0625
+        >>> round(float(PowerStep(0.5, 0.75, delay=100)(1500)), 4)
         0.0625
 
     Args:
         eta: the first step, a positive number.
         alpha: the exponent, 1/2 < alpha < 1.
+        delay: a positive number.
 
     Raises:
         InputError: numbers outside these ranges.
@@ -56,11 +62,16 @@ class PowerStep(eqx.Module):
 
     eta: Array
     alpha: Array
+    delay: Array
 
-    def __init__(self, eta: Any, alpha: Any = 0.6):
-        self.eta, self.alpha = as_array("eta", eta), as_array("alpha", alpha)
-        if is_concrete(self.eta) and not (self.eta.ndim == 0 and float(self.eta) > 0):
-            raise fail("eta", str(self.eta), "be a positive number", "It is the first step.")
+    def __init__(self, eta: Any, alpha: Any = 0.6, delay: Any = 1.0):
+        self.eta, self.alpha, self.delay = as_array("eta", eta), as_array("alpha", alpha), as_array("delay", delay)
+        for name, value, remedy in (
+            ("eta", self.eta, "It is the first step."),
+            ("delay", self.delay, "1 lets steps fall from the start."),
+        ):
+            if is_concrete(value) and not (value.ndim == 0 and float(value) > 0):
+                raise fail(name, str(value), "be a positive number", remedy)
         if is_concrete(self.alpha) and not (self.alpha.ndim == 0 and 0.5 < float(self.alpha) < 1):
             raise fail(
                 "alpha",
@@ -70,7 +81,7 @@ class PowerStep(eqx.Module):
             )
 
     def __call__(self, n: Array) -> Array:
-        return self.eta * (jnp.asarray(n, self.eta.dtype) + 1) ** -self.alpha
+        return self.eta * (1 + jnp.asarray(n, self.eta.dtype) / self.delay) ** -self.alpha
 
 
 class ConstantStep(eqx.Module):
