@@ -18,7 +18,7 @@ from perfcontrol._checks import as_array, check_shape, fail
 from perfcontrol.costs import QuadraticCost
 from perfcontrol.perturbations import StockPerturbation
 from perfcontrol.problem import PerformativeProblem
-from perfcontrol.random_vectors import Linear, StochasticVolatility, Uniform
+from perfcontrol.random_vectors import AbstractRandomVector, Linear, StochasticVolatility, Uniform
 from perfcontrol.sets import AbstractSet, RepeatedBlock, RowSimplex, RowSum
 from perfcontrol.systems import LinearSystem
 
@@ -86,23 +86,46 @@ def stock_market(
     growth, investment = as_array("growth", growth), as_array("initial_investment", initial_investment)
     for name, value in (("growth", growth), ("initial_investment", investment)):
         check_shape(name, value, (), (), "Pass one number, the same for every stock.")
+    return investment_problem(
+        growth=StochasticVolatility(stock_sensitivities(order), rate, volatility, STOCKS),
+        risk=Uniform(np.zeros(STOCKS), np.ones(STOCKS)),
+        horizon=HORIZON,
+        capital=investment,
+        trading_hours=trading_hours,
+        feasible_set=feasible_set,
+        persistence=growth,
+    )
+
+
+def investment_problem(
+    *,
+    growth: AbstractRandomVector,
+    risk: AbstractRandomVector,
+    horizon: int,
+    capital: Any,
+    trading_hours: Any,
+    feasible_set: str,
+    persistence: Any = 1.0,
+) -> PerformativeProblem:
+    """Example 1 for any laws of the day's price ratios and of the risk w_t, of L stocks each; A = persistence I."""
     if not 0 < float(trading_hours) < 24:
         raise fail("trading_hours", str(trading_hours), "lie between 0 and 24", "Hours per day.")
     exposure = float(trading_hours) / (24 - float(trading_hours))
     sets: dict[str, AbstractSet] = {"rows": RowSum(exposure), "simplex": RowSimplex(exposure)}
     if feasible_set not in sets:
         raise fail("feasible_set", repr(feasible_set), f"be one of {tuple(sets)}", "Pass one of these names.")
-    eye, zero = np.eye(STOCKS), np.zeros((STOCKS, STOCKS))
+    count = risk.size
+    eye, zero = np.eye(count), np.zeros((count, count))
     shown = np.block([[eye, zero], [zero, zero]])  # only the first half of state and input is paid for
-    unit_noise = Uniform(np.zeros(STOCKS), np.ones(STOCKS))
+    shift = np.concatenate([-np.asarray(risk.mean), np.zeros(count)])
     return PerformativeProblem(
-        system=LinearSystem.diagonal(growth * jnp.ones(2 * STOCKS), jnp.ones(2 * STOCKS)),
-        horizon=HORIZON,
-        noise=Linear(unit_noise, np.vstack([eye, eye]), np.concatenate([-np.full(STOCKS, 0.5), np.zeros(STOCKS)])),
+        system=LinearSystem.diagonal(persistence * jnp.ones(2 * count), jnp.ones(2 * count)),
+        horizon=horizon,
+        noise=Linear(risk, np.vstack([eye, eye]), shift),
         cost=QuadraticCost(shown, shown),
         memory=1,
-        perturbation=StockPerturbation(StochasticVolatility(stock_sensitivities(order), rate, volatility), exposure),
+        perturbation=StockPerturbation(growth, exposure),
         feasible_set=sets[feasible_set],
-        initial_state=jnp.concatenate([jnp.zeros(STOCKS), jnp.full(STOCKS, investment)]),
+        initial_state=jnp.concatenate([jnp.zeros(count), jnp.full(count, capital)]),
         structure=RepeatedBlock(2),
     )
