@@ -51,7 +51,9 @@ class StockDraws(Draws):
         return jax.vmap(one)(self.deviation, self.mean_diagonal)
 
 
-class _StockCovariance(CovarianceOperator):
+class StockCovariance(CovarianceOperator):
+    """What the diagonal covariances of V do to [r; q]."""
+
     spread: Array  # (T, L, L): of V's diagonal, portfolio Cov(e) portfolioᵀ
 
     @property
@@ -118,7 +120,7 @@ class StockPerturbation(AbstractPerturbation):
 
     def covariance(self, M: Array, horizon: int) -> CovarianceOperator:
         portfolio = self.portfolio(M)
-        return _StockCovariance(along_time(portfolio @ self.growth.covariance @ portfolio.T, 2, horizon))
+        return StockCovariance(along_time(portfolio @ self.growth.covariance @ portfolio.T, 2, horizon))
 
     def bound(self, feasible_set: Any, horizon: int) -> Array | None:
         """Known on a bounded set: per stock the 2 x 2 block has Frobenius norm √(a² + b² + (a+b)²)."""

@@ -208,3 +208,59 @@ def test_gap_and_cells_must_make_sense():
     for gap in (0.0, -1e-3, 1e-14, float("nan"), float("inf"), "small"):
         assert_refused(lambda gap=gap: pc.optimality_bound(problem, gap=gap), "gap", "1e-09")
     assert_refused(lambda: pc.optimality_bound(problem, max_cells=0), "max_cells", "1")
+
+
+STOCKS = 3
+
+
+def small_market(seed: int, feasible: str = "rows", alike: bool = True) -> pc.PerformativeProblem:
+    """Three stocks over four days, each seen by itself."""
+    rng = np.random.default_rng(seed)
+    exposure, eye = 0.4, np.eye(2 * STOCKS)
+    shown = np.diag(np.r_[np.ones(STOCKS), np.zeros(STOCKS)])
+    covariance = rng.uniform(0.02, 0.2, 4)[:, None, None] * np.eye(STOCKS)
+    bought = np.full(STOCKS, 3.0) if alike else np.array([1.0, 3.0, 9.0])
+    return pc.PerformativeProblem(
+        system=pc.LinearSystem(rng.uniform(0.8, 1.1) * eye, eye), horizon=4, memory=1, gain=np.zeros_like(eye),
+        noise=pc.Uniform(-np.ones(2 * STOCKS), np.ones(2 * STOCKS)), cost=pc.QuadraticCost(shown, shown),
+        perturbation=pc.StockPerturbation(pc.LogNormal(np.zeros(STOCKS), covariance), exposure),
+        feasible_set=pc.RowSum(exposure) if feasible == "rows" else pc.RowSimplex(exposure),
+        initial_state=np.r_[np.zeros(STOCKS), bought], structure=pc.RepeatedBlock(2),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("feasible", "alike"), [("rows", True), ("rows", False), ("simplex", True)])
+def test_stocks_are_bounded_row_by_row(feasible, alike):
+    problem = small_market(1, feasible, alike)
+    bound = pc.optimality_bound(problem)
+    assert bound.closed and bound.status == "proved"
+    # The parts of the rows add up to the cost that the whole problem has.
+    assert float(pc.expected_cost(problem, bound.M)) == pytest.approx(bound.upper, rel=1e-11)
+    rng = np.random.default_rng(0)
+    near = np.asarray(bound.M) + rng.choice([1e-3, 0.03, 0.3], (2000, 1, 1, 1)) * rng.normal(size=(2000, 1, 3, 3))
+    costs = _costs(problem, jnp.asarray(near))
+    assert bound.lower <= float(costs.min()) and bound.upper <= float(costs.min()) * (1 + 1e-9)
+
+
+def test_stocks_that_are_alike_share_their_bound_with_stocks_taken_apart(monkeypatch):
+    together = pc.optimality_bound(small_market(2))
+    monkeypatch.setattr("perfcontrol.theory.optimality.stock_rows._alike", lambda problem: False)
+    apart = pc.optimality_bound(small_market(2))
+    assert together.cells < apart.cells
+    assert [together.upper, together.lower] == pytest.approx([apart.upper, apart.lower], rel=1e-3)
+
+
+def test_what_stocks_need_is_named_where_it_is_missing():
+    problem = small_market(3)
+
+    def changed(**parts):
+        names = ("system", "horizon", "memory", "gain", "noise", "cost", "perturbation", "feasible_set", "structure")
+        return pc.PerformativeProblem(**{name: getattr(problem, name) for name in names} | parts)
+
+    free = changed(feasible_set=pc.Unconstrained())
+    assert "the feasible set" in str(pc.optimality_bound(free))
+    paid = changed(cost=pc.QuadraticCost(np.ones((6, 6)), np.eye(6)))
+    assert "couple the stocks" in str(pc.optimality_bound(paid))
+    correlated = pc.LogNormal(np.zeros(STOCKS), 0.02 * (np.eye(STOCKS) + 1))
+    related = changed(perturbation=pc.StockPerturbation(correlated, 0.4))
+    assert "independently" in str(pc.optimality_bound(related))

@@ -92,7 +92,8 @@ def _worlds(problem: PerformativeProblem, base: Any, variances: Any, along: Any)
     return world, eqx.tree_at(lambda w: (w.F, w.B, w.noise_mean, w.noise_covariance), derivative, kept)
 
 
-def _expand(problem: PerformativeProblem, base: np.ndarray, world: CostToGo) -> Expansion:
+def expand(problem: PerformativeProblem, base: np.ndarray, world: CostToGo) -> Expansion:
+    """The cost about `base` in a given world."""
     cost, gradient = weigh(problem, world, base)
     return Expansion(cost, gradient.reshape(-1), response_hessian(problem, world))
 
@@ -100,7 +101,7 @@ def _expand(problem: PerformativeProblem, base: np.ndarray, world: CostToGo) -> 
 def expansion(problem: PerformativeProblem, variances: np.ndarray) -> Expansion:
     """The cost about the policy nearest to zero at given variances (T, k)."""
     base, theta = nearest_to_zero(problem), variances.astype(problem.dtype)
-    return _expand(problem, base, _worlds(problem, base, theta, np.zeros_like(theta))[0])
+    return expand(problem, base, _worlds(problem, base, theta, np.zeros_like(theta))[0])
 
 
 def expansions(problem: PerformativeProblem, variances: np.ndarray, along: np.ndarray) -> tuple[Expansion, Expansion]:
@@ -117,8 +118,8 @@ def expansions(problem: PerformativeProblem, variances: np.ndarray, along: np.nd
         replace_fn=lambda leaf: None if leaf is None else np.zeros_like(leaf),
         is_leaf=lambda leaf: leaf is None,
     )
-    slope, rest = _expand(problem, base, derivative), _expand(problem, base, zeros)
-    return _expand(problem, base, world), Expansion(*(one - other for one, other in zip(slope, rest, strict=True)))
+    slope, rest = expand(problem, base, derivative), expand(problem, base, zeros)
+    return expand(problem, base, world), Expansion(*(one - other for one, other in zip(slope, rest, strict=True)))
 
 
 def simplified(problem: PerformativeProblem) -> PerformativeProblem:

@@ -13,7 +13,7 @@ import numpy as np
 
 from perfcontrol._checks import check_integer, fail
 from perfcontrol.evaluate import expected_cost
-from perfcontrol.perturbations import DirectionalPerturbation, NoPerturbation
+from perfcontrol.perturbations import DirectionalPerturbation, NoPerturbation, StockPerturbation
 from perfcontrol.problem import PerformativeProblem, check_problem
 from perfcontrol.solvers.optimum import PerformativeOptimum
 from perfcontrol.solvers.solve import solve
@@ -25,6 +25,7 @@ from perfcontrol.theory.existence import constant_mean
 from perfcontrol.theory.optimality.recognise import scalars_of
 from perfcontrol.theory.optimality.relaxation import relaxation_of
 from perfcontrol.theory.optimality.search import Search, Share
+from perfcontrol.theory.optimality.stock_rows import obstacles_to_rows, row_shares
 from perfcontrol.theory.precision import in_double
 
 LEAST_GAP = 1e-9  # rounding of costs and of minimisers leaves no smaller one provable
@@ -76,6 +77,8 @@ def optimality_bound(problem: PerformativeProblem, gap: float = 1e-3, max_cells:
 
     For quadratic costs and perturbations along fixed directions whose mean does not react along the feasible set, with
     scales that are constant, `Affine` of rank up to three, a `Norm`, or a `Function(f, convex=True)` of values (k,).
+    And for `StockPerturbation` on sets that fix the row sums, where stocks grow independently and alike and nothing
+    else couples them.
 
     Args:
         problem: a finite horizon.
@@ -105,16 +108,20 @@ def optimality_bound(problem: PerformativeProblem, gap: float = 1e-3, max_cells:
     searches = [Search(share, best) for share in shares]
 
     def ends() -> tuple[float, float]:
-        return sum(search.lower for search in searches), sum(search.upper for search in searches)
+        return sum(s.times * s.lower for s in searches), sum(s.times * s.upper for s in searches)
 
     while sum(search.cells for search in searches) < max_cells:
         lower, upper = ends()
         if upper - lower <= gap * abs(upper):
             break
-        max(searches, key=lambda search: search.gap).refine()
+        max(searches, key=lambda search: search.times * search.gap).refine()
     lower, upper = ends()
     width = (upper - lower) / abs(upper) if upper else 0.0
-    cells, M = sum(search.cells for search in searches), searches[0].M.reshape(problem.policy_shape)
+    cells = sum(search.cells for search in searches)
+    M = np.zeros_like(best)
+    for search in searches:
+        M[search.share.places] = search.M
+    M = M.reshape(problem.policy_shape)
     return OptimalityBound(True, (), lower, upper, M, width, width <= gap, cells, _assumptions(problem))
 
 
@@ -123,17 +130,22 @@ def _missing(problem: PerformativeProblem) -> list[str]:
         return ["the horizon is infinite: bound problem.truncated(200), or another finite horizon"]
     missing = obstacles(problem)
     law = problem.perturbation
-    if not isinstance(law, DirectionalPerturbation | NoPerturbation):
+    if isinstance(law, StockPerturbation):
+        missing += obstacles_to_rows(problem)
+    elif not isinstance(law, DirectionalPerturbation | NoPerturbation):
         wanted = "perturbation=pc.DirectionalPerturbation(directions, pc.Norm(offset, weight))"
         missing.append(f"the perturbations are not of fixed directions: pass {wanted}")
-    elif not constant_mean(problem):
-        missing.append("the mean of the perturbations depends on the policy: pass mean=None")
+    if not missing and not constant_mean(problem):
+        remedy = "pass mean=None, or for stocks a set that fixes the row sums, such as pc.RowSum(exposure)"
+        missing.append(f"the mean of the perturbations depends on the policy: {remedy}")
     if problem.noise_reacts:
         missing.append(FIXED_NOISE)
     return missing
 
 
 def _shares(problem: PerformativeProblem) -> list[Share] | str:
+    if isinstance(problem.perturbation, StockPerturbation):
+        return row_shares(problem)
     if isinstance(problem.perturbation, NoPerturbation):
         still = DirectionalPerturbation(np.eye(problem.state_size)[None], np.zeros(1))
         problem = eqx.tree_at(lambda p: p.perturbation, problem, still)
@@ -149,7 +161,9 @@ def _shares(problem: PerformativeProblem) -> list[Share] | str:
         found = np.asarray(solve(problem, PerformativeOptimum(), M.reshape(shape), throw=False).M, dtype=float)
         return found.reshape(-1) if value(found) < value(M) else M
 
-    return [Share(scalars, lambda variances: expansion(problem, variances), relaxation_of(problem), value, improve)]
+    everywhere = np.arange(np.prod(shape))[None]
+    form, relax = (lambda variances: expansion(problem, variances)), relaxation_of(problem)
+    return [Share(everywhere, scalars, form, relax, value, improve)]
 
 
 def _assumptions(problem: PerformativeProblem) -> tuple[Assumption, ...]:

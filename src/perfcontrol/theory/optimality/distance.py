@@ -1,5 +1,7 @@
 """Scales that go by the distance from one policy: cells are shells about it."""
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 
@@ -12,17 +14,24 @@ from perfcontrol.theory.optimality.scalars import AbstractScalars
 class Distance(AbstractScalars):
     """σ = offset + weight r, or r², r² = norm² s² + outside², s = ‖M - center‖ of the free parameters."""
 
-    def __init__(self, problem: PerformativeProblem, scale: Norm, shape: tuple[int, int]):
-        lifted = problem.lifted_shape
-        center = np.zeros(lifted) if scale.center is None else np.asarray(scale.center, dtype=float)
-        free = np.asarray(problem.structure.adjoint(jnp.asarray(center))) / problem.structure.norm**2
-        self.outside = float(np.linalg.norm(center - np.asarray(problem.structure.lift(jnp.asarray(free)))))
-        self.center, self.norm = free.reshape(-1).astype(float), problem.structure.norm
-        self.offset, self.weight = (np.broadcast_to(np.asarray(x, float), shape) for x in (scale.offset, scale.weight))
-        self.power = 2 if scale.squared else 1
-        far = problem.feasible_set.farthest(jnp.asarray(free))
-        self.low = np.atleast_1d(np.asarray(problem.feasible_set.distance(jnp.asarray(free)), dtype=float))
-        self.high = np.atleast_1d(np.inf if far is None else np.asarray(far, dtype=float))
+    def __init__(
+        self, center: np.ndarray, low: Any, high: Any, offset: Any, weight: Any, power: int, norm: float, outside: float
+    ):
+        self.center, self.offset, self.weight, self.power = center, np.asarray(offset), np.asarray(weight), power
+        self.norm, self.outside = norm, outside
+        self.low, self.high = (np.atleast_1d(np.asarray(end, dtype=float)) for end in (low, high))
+
+    @classmethod
+    def of(cls, problem: PerformativeProblem, scale: Norm, shape: tuple[int, int]) -> "Distance":
+        """The distance that a `Norm` goes by, of the free parameters, values of `shape` (T, k)."""
+        center = jnp.zeros(problem.lifted_shape) if scale.center is None else jnp.asarray(scale.center, float)
+        structure = problem.structure
+        free = structure.adjoint(center) / structure.norm**2
+        outside = float(np.linalg.norm(center - structure.lift(free)))
+        offset, weight = (np.broadcast_to(np.asarray(part, float), shape) for part in (scale.offset, scale.weight))
+        near, far = problem.feasible_set.distance(free), problem.feasible_set.farthest(free)
+        origin, power = np.asarray(free, dtype=float).reshape(-1), 2 if scale.squared else 1
+        return cls(origin, near, np.inf if far is None else far, offset, weight, power, structure.norm, outside)
 
     def at(self, M: np.ndarray) -> np.ndarray:
         return np.atleast_1d(np.linalg.norm(M - self.center))

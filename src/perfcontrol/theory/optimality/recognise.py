@@ -30,7 +30,7 @@ def scalars_of(problem: PerformativeProblem) -> AbstractScalars | str:
     shape, scale = (problem.horizon, law.directions.shape[0]), law.scale
     policy = jax.ShapeDtypeStruct(problem.lifted_shape, problem.dtype)
     if isinstance(scale, Norm):
-        return Distance(problem, scale, shape)
+        return Distance.of(problem, scale, shape)
     derivative = scale.derivative()
     if scale.constant or derivative is not None:
         size = int(np.prod(problem.policy_shape))

@@ -13,8 +13,9 @@ from perfcontrol.theory.optimality.scalars import AbstractScalars
 
 
 class Share(NamedTuple):
-    """A part of the cost with scalars and parameters of its own; shares add up to the cost."""
+    """A part of the cost with scalars and parameters of its own; shares, each as often as it occurs, add up to it."""
 
+    places: np.ndarray  # (times, p): where its parameters stand in the policy, flattened, for each time it occurs
     scalars: AbstractScalars
     form: Callable[[np.ndarray], Expansion]  # variances (T, k) -> the cost as a convex quadratic
     relax: Callable[[Expansion], Relaxation]
@@ -25,11 +26,14 @@ class Share(NamedTuple):
 class Search:
     """lower ≤ min C(M; M) ≤ upper = C(M; M) at M, for one share; every `refine` raises the first or lowers the last."""
 
-    def __init__(self, share: Share, M: np.ndarray):
-        self.share, self.M, self.upper = share, M, share.value(M)
+    def __init__(self, share: Share, policy: np.ndarray):
+        self.share, self.times = share, len(share.places)
+        self.upper, _, self.M = min(
+            (share.value(policy[place]), i, policy[place]) for i, place in enumerate(share.places)
+        )
         self.cells, self._count = 0, itertools.count()
         self._heap: list[tuple[float, int, np.ndarray, np.ndarray]] = []
-        self._unit = np.maximum(np.abs(share.scalars.at(M)), 1e-3)
+        self._unit = np.maximum(np.abs(share.scalars.at(self.M)), 1e-3)
         self._add(-np.inf, share.scalars.low, share.scalars.high)
 
     @property
