@@ -20,10 +20,10 @@ from perfcontrol.experiments.reproduce.exact import exact_stage
 from perfcontrol.experiments.reproduce.laboratory import constant_step, laboratory
 from perfcontrol.experiments.reproduce.stages import Stages
 from perfcontrol.plotting import paper_figures
-from perfcontrol.report.paper import judge, regimes
+from perfcontrol.report.paper import judge, regimes, theorems
 
 SETTINGS = ReproduceSettings(seeds=3, steps=100, cure_steps=200, sweep_seeds=2, sweep_steps=100)
-STAGES = ("exact", "exact_simplex", "runs", "cure", "sweep")
+STAGES = ("exact", "exact_simplex", "optimum", "runs", "cure", "sweep")
 
 
 @pytest.fixture(scope="module")
@@ -96,6 +96,8 @@ def test_claims_are_complete_and_existence_is_settled(done: tuple[Path, Outcome]
     existence = next(claim for claim in claims if "existence" in claim["claim"])
     assert existence["verdict"] == "does not hold"
     assert existence["value"] <= 1e-11
+    price = next(claim for claim in claims if "nearly optimal" in claim["claim"])
+    assert price["verdict"] == "does not hold" and price["interval"][0] == price["value"] > 7
     printed = next(claim for claim in claims if "N(log ε_t" in claim["claim"])
     assert printed["verdict"] == "does not hold"
 
@@ -103,7 +105,7 @@ def test_claims_are_complete_and_existence_is_settled(done: tuple[Path, Outcome]
 def test_without_the_simplex_its_claim_and_its_curve_are_left_out(done: tuple[Path, Outcome], tmp_path: Path) -> None:
     data = {name: results.load_dataset(done[0] / f"{name}.nc") for name in STAGES}
     exact, runs, sweep, cure = data["exact"], data["runs"], data["sweep"], data["cure"].drop_vars("simplex")
-    claims = judge(exact, None, runs, cure, sweep, SETTINGS)
+    claims = judge(exact, None, data["optimum"], runs, cure, sweep, SETTINGS)
     missing = {claim.claim for claim in done[1].claims} - {claim.claim for claim in claims}
     assert len(missing) == 1
     assert "simplex" in missing.pop()
@@ -172,3 +174,18 @@ def test_verdicts_follow_the_data(final: float, decays: bool, diverges: bool) ->
     assert (regimes.iterates_diverge(runs).verdict != "does not hold") is diverges
     assert regimes.cost_is_larger(runs).verdict == "does not hold"
     assert regimes.order_is_negligible(runs).verdict == "holds as completed"
+
+
+@pytest.mark.parametrize(("dear", "holds"), [(1.04, True), (1.2, False)])
+def test_verdict_on_the_price_of_stability_follows_the_dearest_case(dear: float, holds: bool) -> None:
+    cost = np.full((3, 3), 10.0)
+    cost[1, 2] *= dear
+    over = ("regime", "order")
+    exact = xarray.Dataset({"cost": (over, cost)}, coords=CASES)
+    optimum = xarray.Dataset(
+        {"cost": (over, np.full((3, 3), 10.0)), "lower": (over, np.full((3, 3), 8.0))}, coords=CASES
+    )
+    claim = theorems.price_of_stability(exact, optimum)
+    assert (claim.verdict == "holds") is holds
+    assert claim.interval == pytest.approx((dear, dear / 0.8)) and "20 %" in claim.detail
+    assert f"{CASES['regime'][1]}/{CASES['order'][2]}" in claim.statistic

@@ -1,6 +1,7 @@
 """The figures of the paper's numerical section, and the one it lacks."""
 
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 
@@ -16,12 +17,13 @@ from perfcontrol.config import ReproduceSettings
 from perfcontrol.plotting.style import ORDER_COLOURS, ORDER_MARKS, REGIME_TITLES, band, save_figure, styled
 from perfcontrol.report.paper.divergence import share_that_left
 
+OPTIMUM: Any = {"linestyle": (0, (6, 2, 1, 2)), "linewidth": 0.9}
 CEILING = 1e4  # of the error axis, relative to the first error: beyond it a run has left for good
 
 
 def draw_all(
     out: Path,
-    exact: xarray.Dataset,
+    optimum: xarray.Dataset,
     runs: xarray.Dataset,
     cure: xarray.Dataset,
     sweep: xarray.Dataset,
@@ -30,7 +32,7 @@ def draw_all(
     """Figures 1, 2 and 3 as PNG and SVG."""
     with styled():
         files = figure_error(runs, out / "figure1_error")
-        files += figure_cost(runs, out / "figure2_cost")
+        files += figure_cost(runs, optimum, out / "figure2_cost")
         files += figure_cure(cure, sweep, settings, out / "figure3_cure")
     return files
 
@@ -88,8 +90,8 @@ def figure_error(runs: xarray.Dataset, path: Path) -> list[Path]:
     return save_figure(figure, path)
 
 
-def figure_cost(runs: xarray.Dataset, path: Path) -> list[Path]:
-    """Figure 2: exact performative cost of the iterates, the stable policy's as a dotted line."""
+def figure_cost(runs: xarray.Dataset, optimum: xarray.Dataset, path: Path) -> list[Path]:
+    """Figure 2: exact performative cost of the iterates; dotted the stable, dash-dotted the optimal policy's."""
     figure, panels = plt.subplots(1, 3, figsize=(7.4, 2.6), layout="constrained")
     steps = runs["step"].values[1:]
     for axes, regime in zip(panels, REGIME_TITLES, strict=True):
@@ -101,7 +103,9 @@ def figure_cost(runs: xarray.Dataset, path: Path) -> list[Path]:
             low, middle, high = _quantiles(np.minimum(values[:, 1:], ceiling))
             band(axes, steps, low, middle, high, order)
             axes.axhline(stable, color=colour, linestyle=":", linewidth=1)
-            lowest = min(lowest, stable, low.min())
+            cheapest = float(optimum["cost"].sel(regime=regime, order=order))
+            axes.axhline(cheapest, color=colour, **OPTIMUM)
+            lowest = min(lowest, stable, cheapest, low.min())
             highest = max(highest, np.median(values[:, 0]), min(middle.max(), 300 * np.median(values[:, 0])))
         _log_axes(axes)
         axes.set_ylim(lowest / 1.6, highest * 1.6)
@@ -109,6 +113,7 @@ def figure_cost(runs: xarray.Dataset, path: Path) -> list[Path]:
         axes.set_xlabel("iteration $n$")
     panels[0].set_ylabel(r"$C_T(M_n; M_n)$")
     panels[0].plot([], [], color="#555555", linestyle=":", linewidth=1, label=r"at $M^{\mathrm{PS}}$")
+    panels[0].plot([], [], color="#555555", label=r"at $M^{\mathrm{PO}}$", **OPTIMUM)
     _orders_legend(figure, panels[0])
     return save_figure(figure, path)
 

@@ -1,7 +1,8 @@
 """The paper's numerical section, run again: every stage kept on disk as it ends, so that a killed run resumes.
 
-Stages: `exact` (stable points without sampling), `runs` (the paper's RSGD), `cure` (what mends the divergence),
-`sweep` (where divergence begins as the step grows). Then figures and the table of claims.
+Stages: `exact` (stable points without sampling), `optimum` (the cheapest policies, proved), `runs` (the paper's RSGD),
+`cure` (what mends the divergence), `sweep` (where divergence begins as the step grows). Then figures and the table of
+claims.
 """
 
 import time
@@ -18,12 +19,13 @@ from perfcontrol.experiments.reproduce.cases import Progress, problems_of, silen
 from perfcontrol.experiments.reproduce.divergence import cure_stage, sweep_stage
 from perfcontrol.experiments.reproduce.exact import exact_stage, repeated_minimisation
 from perfcontrol.experiments.reproduce.laboratory import laboratory, run_stage
+from perfcontrol.experiments.reproduce.optimum import optimum_stage
 from perfcontrol.experiments.reproduce.stages import Stages
 from perfcontrol.plotting import paper_figures
 from perfcontrol.report.claims import Claim, as_markdown
 from perfcontrol.report.paper import judge
 
-STAGES = ("exact", "exact_simplex", "runs", "cure", "sweep")
+STAGES = ("exact", "exact_simplex", "optimum", "runs", "cure", "sweep")
 
 
 class Outcome(NamedTuple):
@@ -61,7 +63,8 @@ def reproduce(out: Path, settings: ReproduceSettings, progress: Progress | None 
             pool.submit(stages.run, "exact_simplex", lambda: exact_stage(bounded_problems, settings, silent))
             for _ in range(settings.simplex)
         ]
-        exact = stages.run("exact", exact_and_repeated)
+        exact = stages.run("exact", exact_and_repeated)  # compiles what the optimum needs as well
+        optimum = stages.run("optimum", lambda: optimum_stage(problems, progress))
         exact_bounded = waiting[0].result() if waiting else None
     lab = laboratory(settings, problems, exact)
     bounded = None if exact_bounded is None else laboratory(settings, bounded_problems, exact_bounded)
@@ -69,12 +72,12 @@ def reproduce(out: Path, settings: ReproduceSettings, progress: Progress | None 
     cure = stages.run("cure", lambda: cure_stage(lab, bounded, settings, progress))
     sweep = stages.run("sweep", lambda: sweep_stage(lab, settings, progress))
     began = time.monotonic()
-    claims = judge(exact, exact_bounded, runs, cure, sweep, settings)
+    claims = judge(exact, exact_bounded, optimum, runs, cure, sweep, settings)
     results.save_json([claim.as_dict() for claim in claims], out / "claims.json")
     results.save_text(as_markdown(claims, settings.model_dump()), out / "claims.md")
     stages.seconds["claims"] = time.monotonic() - began
     began = time.monotonic()
-    files = paper_figures.draw_all(out, exact, runs, cure, sweep, settings)
+    files = paper_figures.draw_all(out, optimum, runs, cure, sweep, settings)
     stages.seconds["figures"] = time.monotonic() - began
     data = [out / f"{stage}.nc" for stage in STAGES if stage in stages.seconds]
     return Outcome([*data, out / "claims.json", out / "claims.md", *files], claims, stages.seconds)

@@ -10,6 +10,7 @@ from perfcontrol.report.paper import divergence, regimes, theorems
 def judge(
     exact: xarray.Dataset,
     exact_bounded: xarray.Dataset | None,
+    optimum: xarray.Dataset,
     runs: xarray.Dataset,
     cure: xarray.Dataset,
     sweep: xarray.Dataset,
@@ -36,5 +37,6 @@ def judge(
         divergence.smaller_step(cure),
         *([] if exact_bounded is None else [divergence.bounded_set(cure)]),
         regimes.stable_is_not_optimal(runs),
+        theorems.price_of_stability(exact, optimum),
         theorems.as_printed(exact),
     ]
