@@ -53,7 +53,7 @@ def optimal_policy(problem: PerformativeProblem, gap: float = GAP) -> tuple[floa
 
     # Beyond [low, high] even the calmest world is dearer than the policy that spreads everything evenly.
     calmest, even = parabola(0.0), cost(0.0)
-    low, high = np.sort((calmest - even).roots.real)
+    low, high = np.sort(np.real((calmest - even).roots))
     if problem.feasible_set.nonnegative:
         total, stocks = float(problem.feasible_set.row_total), problem.policy_shape[1]  # type: ignore[arg-type]
         low, high = max(low, -total / stocks), min(high, total * (stocks - 1) / stocks)
