@@ -324,6 +324,7 @@ GIVEN_BACK = {
     "Fit",
     "OptimalityBound",
     "PriceOfStability",
+    "Decision",
     "ReactionTest",
     "Solution",
     "StateMoments",

@@ -28,7 +28,7 @@ from perfcontrol.evaluate import (
     simulate,
     state_moments,
 )
-from perfcontrol.identification import Fit, Logs, ReactionTest, fit, test_reaction
+from perfcontrol.identification import Decision, Fit, Logs, ReactionTest, fit, test_reaction
 from perfcontrol.perturbations import (
     AbstractPerturbation,
     DensePerturbation,
@@ -134,6 +134,7 @@ __all__ = [
     "Constant",
     "Continuation",
     "ConvexCost",
+    "Decision",
     "DensePerturbation",
     "DirectionalPerturbation",
     "DisturbanceAction",

@@ -8,10 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from perfcontrol.identification.features import Features
-from perfcontrol.identification.logs import Logs
 from perfcontrol.perturbations import AbstractPerturbation, DirectionalPerturbation, NoPerturbation
 from perfcontrol.problem import PerformativeProblem
-from perfcontrol.random_vectors import AbstractRandomVector, Constant, Gaussian
+from perfcontrol.random_vectors import Gaussian
 from perfcontrol.systems import LinearSystem
 
 
@@ -19,7 +18,7 @@ class Coefficients(eqx.Module):
     """Everything that a fitted problem is built from; a leading axis makes a stack.
 
     A, B, noise mean and covariance; mean (n, p, 1+q) and scale (k, 1+q): coefficients by the features of the policy;
-    directions (k, n, p).
+    directions (k, n, p); mean and covariance of the initial state.
     """
 
     A: Any
@@ -29,12 +28,19 @@ class Coefficients(eqx.Module):
     mean: Any
     scale: Any
     directions: Any
+    start_mean: Any
+    start_covariance: Any
 
 
-def build(c: Coefficients, *, features: tuple[Features, Features], law: str, **world: Any) -> PerformativeProblem:
+def build(
+    c: Coefficients, *, features: tuple[Features, Features], law: str, initial_state: Any, **world: Any
+) -> PerformativeProblem:
     """The problem of coefficients by the features of mean and scale; works under vmap over `c`."""
     c = jax.tree.map(lambda numbers: jnp.asarray(numbers, float), c)
+    if initial_state is None:
+        initial_state = Gaussian(c.start_mean, c.start_covariance)
     return PerformativeProblem(
+        initial_state=initial_state,
         system=LinearSystem(c.A, c.B),
         noise=Gaussian(c.noise_mean, c.noise_covariance),
         perturbation=_perturbation(c, *features, law),
@@ -51,10 +57,9 @@ def _perturbation(c: Coefficients, mean: Features, scale: Features, law: str) ->
     return NoPerturbation()
 
 
-def logged_start(logs: Logs) -> AbstractRandomVector:
-    """The law of x_0: mean and covariance of the logged first states."""
-    first = np.stack([x[0] for x in logs.x])
-    if np.ptp(first, axis=0).max() == 0:
-        return Constant(first[0])
-    centred = first - first.mean(axis=0)
-    return Gaussian(first.mean(axis=0), centred.T @ centred / len(first))
+def logged_start(first: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and covariance of the first states (E, n), with weights (E,) on the episodes."""
+    share = weights / weights.sum() if weights.sum() > 0 else np.full(len(first), 1 / len(first))
+    mean = share @ first
+    centred = first - mean
+    return mean, (centred * share[:, None]).T @ centred

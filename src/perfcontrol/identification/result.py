@@ -10,6 +10,7 @@ import numpy as np
 
 from perfcontrol._checks import check_integer, check_key, fail
 from perfcontrol.evaluate import Estimate
+from perfcontrol.identification.decision import Decision, decide
 from perfcontrol.identification.estimate import Estimated
 from perfcontrol.identification.features import Features
 from perfcontrol.identification.logs import Logs
@@ -19,6 +20,8 @@ from perfcontrol.identification.report import paragraph, table
 from perfcontrol.identification.transitions import Transitions
 from perfcontrol.identification.unidentified import Gap, gaps
 from perfcontrol.problem import PerformativeProblem
+from perfcontrol.random_vectors import Constant
+from perfcontrol.solvers import AbstractSolver, StablePoint
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +123,7 @@ class Fit:
             cost: as `pc.PerformativeProblem` takes it.
             horizon: likewise.
             feasible_set: likewise.
-            initial_state: its law; None for mean and covariance of the logged first states.
+            initial_state: its law; None for mean and covariance of the logged first states (resampled in `ensemble`).
             structure: as `pc.PerformativeProblem` takes it.
             law: of the random multiples of the directions. Costs of quadratic stages do not depend on it.
 
@@ -128,7 +131,8 @@ class Fit:
             InputError: A or B are not identified (see `unidentified`), or what does not fit the plant.
         """
         spread = self.estimated.spread
-        coefficients = self._coefficients(self.estimated.mean.values, spread.block.values)
+        once = np.ones(len(self.data.group))
+        coefficients = self._coefficients(self.estimated.mean.values, spread.block.values, once)
         world = self._world(initial_state) | {"cost": cost, "horizon": horizon, "law": law}
         return build(coefficients, feasible_set=feasible_set, structure=structure, **world)
 
@@ -161,11 +165,62 @@ class Fit:
             law: likewise.
         """
         weights = self._weights(check_integer("k", k, 1), check_key(key))
-        draws = zip(self.estimated.mean.resampled(weights), self.estimated.spread.block.resampled(weights), strict=True)
-        members = [self._coefficients(mean, spread) for mean, spread in draws]
+        resampled = (self.estimated.mean.resampled(weights), self.estimated.spread.block.resampled(weights))
+        members = [self._coefficients(*draw) for draw in zip(*resampled, weights, strict=True)]
         stacked = jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf, float) for leaf in leaves]), *members)
         world = self._world(initial_state) | {"cost": cost, "horizon": horizon, "law": law}
         return eqx.filter_vmap(lambda c: build(c, feasible_set=feasible_set, structure=structure, **world))(stacked)
+
+    def decide(
+        self,
+        k: int = 200,
+        *,
+        key: Any = None,
+        cost: Any,
+        horizon: int,
+        feasible_set: Any = None,
+        initial_state: Any = None,
+        structure: Any = None,
+        law: str = "rademacher",
+        solver: AbstractSolver = StablePoint(),
+        certificate: Any = "sharp",
+        level: float = 0.95,
+    ) -> Decision:
+        """The stable policy that these logs suggest, and how well they pin it down.
+
+        `problem` and each member of `ensemble` are solved and certified. Intervals lie between quantiles of what the
+        members say.
+
+        Args:
+            k: members of the ensemble; their quantiles need some hundred.
+            key: JAX random key of the ensemble, and of the solver where that samples.
+            cost: as `problem` takes it, and all that follow.
+            horizon: likewise.
+            feasible_set: likewise.
+            initial_state: likewise.
+            structure: likewise.
+            law: likewise.
+            solver: of the stable policy.
+            certificate: a kind, as `pc.certify` takes it.
+            level: of the intervals.
+
+        Returns:
+            A `Decision`: policy and costs with intervals, shares that are solved and certified; str() is a paragraph.
+
+        Raises:
+            InputError: as `problem` and `ensemble`; no member of the ensemble has a stable policy.
+            SolveError: the solver finds no stable policy of the fitted problem.
+        """
+        world = dict(
+            cost=cost,
+            horizon=horizon,
+            feasible_set=feasible_set,
+            initial_state=initial_state,
+            structure=structure,
+            law=law,
+        )
+        ensemble = self.ensemble(k, key=key, **world)
+        return decide(self.problem(**world), ensemble, solver, certificate, level, key)
 
     @property
     def _mean(self) -> MeanReading:
@@ -185,22 +240,30 @@ class Fit:
             weights[:, members] = generator.multinomial(len(members), np.full(len(members), 1 / len(members)), size=k)
         return weights
 
-    def _coefficients(self, mean: np.ndarray, spread: np.ndarray) -> Coefficients:
-        """The numbers of a plant from values of the two blocks."""
+    def _coefficients(self, mean: np.ndarray, spread: np.ndarray, weights: np.ndarray) -> Coefficients:
+        """The numbers of a plant from values of the two blocks, and weights of the units for the initial state."""
         coefficients = self._mean.coefficients(mean)
         read = {name: coefficients @ f.T for name, f in self._mean.functionals().items()}
         noise, scales, directions = self.estimated.spread.at(spread)
         reaction = self._mean.reaction(coefficients)
-        return Coefficients(read["A"], read["B"], read["noise_mean"][:, 0], noise, reaction, scales, directions)
+        start = logged_start(self._first_states, weights[self.data.first])
+        return Coefficients(read["A"], read["B"], read["noise_mean"][:, 0], noise, reaction, scales, directions, *start)
+
+    @property
+    def _first_states(self) -> np.ndarray:
+        return np.stack([x[0] for x in self.logs.x])
 
     def _world(self, initial_state: Any) -> dict[str, Any]:
         """What every plant of this fit shares."""
         blocking = [gap.text for gap in self._gaps() if gap.blocks]
         if blocking:
             raise fail("logs", "; ".join(blocking), "identify A and B", "Log episodes that move what stood still.")
+        first = self._first_states
+        if initial_state is None and np.ptp(first, axis=0).max() == 0:
+            initial_state = Constant(first[0])
         return {
             "features": (self.mean_features, self.scale_features),
             "gain": self.gain if self.gain.ndim else float(self.gain),
             "memory": self.data.policies.shape[1],
-            "initial_state": logged_start(self.logs) if initial_state is None else initial_state,
+            "initial_state": initial_state,
         }

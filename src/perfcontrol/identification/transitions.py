@@ -16,7 +16,8 @@ class Transitions(NamedTuple):
     """y = F x + B v + mean noise + error for every transition, v = u + K x the input beside the feedback.
 
     x (N, n), v (N, m), y (N, n). unit (U+1,): where each unit starts, a unit being an episode or a block of one.
-    group (U,): the deployment of each unit. policies (G, H, m, n). gain (m, n): K, zero where it varies in time.
+    group (U,): the deployment of each unit. first (E,): the first unit of each episode. policies (G, H, m, n).
+    gain (m, n): K, zero where it varies in time.
     """
 
     x: np.ndarray
@@ -24,6 +25,7 @@ class Transitions(NamedTuple):
     y: np.ndarray
     unit: np.ndarray
     group: np.ndarray
+    first: np.ndarray
     policies: np.ndarray
     gain: np.ndarray
 
@@ -50,13 +52,6 @@ class Transitions(NamedTuple):
             yield slice(first, last), slice(int(self.unit[first]), int(self.unit[last]))
             first = last
 
-    def only(self, units: np.ndarray) -> "Transitions":
-        """The units of a mask (U,), with all the policies."""
-        lengths = np.diff(self.unit)
-        rows = np.repeat(units, lengths)
-        start = np.concatenate([[0], np.cumsum(lengths[units])])
-        return self._replace(x=self.x[rows], v=self.v[rows], y=self.y[rows], unit=start, group=self.group[units])
-
 
 def transitions_of(logs: Any, gain: Any, memory: int | None) -> Transitions:
     """The table of checked logs; `gain` and `memory` as `fit` takes them."""
@@ -67,19 +62,19 @@ def transitions_of(logs: Any, gain: Any, memory: int | None) -> Transitions:
     gains = _gains(gain, m, n, max(len(u) for u in logs.u))
     constant = gains if gains.ndim == 2 else np.zeros((m, n))
     cut = -(-UNITS // len(logs)) if len(logs) < UNITS else 1
-    x, v, y, lengths, group = [], [], [], [], []
+    x, v, y, lengths, group, first = [], [], [], [], [], []
     for states, inputs, g in zip(logs.x, logs.u, logs.deployment, strict=True):
         count = len(states) - 1
         x.append(states[:-1])
         y.append(states[1:])
         v.append(inputs[:count] + states[:-1] @ constant.T)
         blocks = np.array_split(np.arange(count), min(cut, count))
+        first.append(len(group))
         lengths += [len(block) for block in blocks]
         group += [g] * len(blocks)
     start = np.concatenate([[0], np.cumsum(lengths)])
-    data = Transitions(
-        np.concatenate(x), np.concatenate(v), np.concatenate(y), start, np.array(group), policies, constant
-    )
+    table = (np.concatenate(x), np.concatenate(v), np.concatenate(y))
+    data = Transitions(*table, start, np.array(group), np.array(first), policies, constant)
     _check_sign(data)
     return data
 
