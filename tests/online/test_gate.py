@@ -76,12 +76,12 @@ def test_policy_passes_where_its_world_is_mean_square_stable_or_no_worse_than_th
     candidate = np.asarray(size * normal(1, 1, 2, 2) / np.linalg.norm(normal(1, 1, 2, 2)))
     limits = gate.limits(problem, solver, 0 * candidate)
     radius = radius_of(problem, candidate)
-    reasons = gate.refuses(problem, limits, candidate, 0 * candidate, 0.1)
+    reasons = gate.refuses(problem, endless(problem), limits, candidate, 0 * candidate, 0.1)
     assert bool(reasons) == (radius >= 1) == (size > 1)
     assert not reasons or f"{radius:.4g}" in reasons[0]
-    assert not gate.refuses(problem, limits, candidate, 1.001 * candidate, 0.1)
+    assert not gate.refuses(problem, endless(problem), limits, candidate, 1.001 * candidate, 0.1)
     tight = pc.online.Gate(**OFF | {"radius": 0.99 * radius})
-    assert tight.refuses(problem, limits, candidate, 0 * candidate, 0.1)
+    assert tight.refuses(problem, endless(problem), limits, candidate, 0 * candidate, 0.1)
 
 
 def test_radius_is_not_asked_for_where_the_model_varies_in_time():
@@ -93,7 +93,10 @@ def test_radius_is_not_asked_for_where_the_model_varies_in_time():
     )
     gate = pc.online.Gate(**OFF | {"radius": 1e-9})
     M = np.zeros((1, 2, 2))
-    assert endless(varying) is None and gate.refuses(varying, gate.limits(varying, pc.RSGD(1, 0.1), M), M, M, 0.1) == []
+    assert (
+        endless(varying) is None
+        and gate.refuses(varying, endless(varying), gate.limits(varying, pc.RSGD(1, 0.1), M), M, M, 0.1) == []
+    )
 
 
 def test_predicted_cost_may_grow_by_the_factor_of_the_gate_and_no_more():
@@ -103,7 +106,9 @@ def test_predicted_cost_may_grow_by_the_factor_of_the_gate_and_no_more():
     assert factor > 1.5
     for cost, passes in ((1.001 * factor, True), (0.999 * factor, False)):
         gate = pc.online.Gate(**OFF | {"cost": cost})
-        reasons = gate.refuses(problem, gate.limits(problem, solver, nothing), candidate, nothing, 0.1)
+        reasons = gate.refuses(
+            problem, endless(problem), gate.limits(problem, solver, nothing), candidate, nothing, 0.1
+        )
         assert (not reasons) == passes
     assert "predicted cost" in reasons[0] and f"{float(pc.expected_cost(problem, candidate)):.4g}" in reasons[0]
 

@@ -13,7 +13,7 @@ from perfcontrol._checks import as_array, check_key, check_shape, fail
 from perfcontrol._fingerprint import fingerprint
 from perfcontrol._programs import Numbers, known
 from perfcontrol.online import files
-from perfcontrol.online.gate import as_gate
+from perfcontrol.online.gate import as_gate, endless
 from perfcontrol.online.learning import check_solver, iterate, learn, taken_back
 from perfcontrol.online.observing import act, costs, observe
 from perfcontrol.online.state import LOGGED, ControllerState, Entry, Limits, Progress, check_state, first_progress
@@ -192,6 +192,10 @@ class Controller:
         return files.restore(self._first(self.problem.initial_policy(), None), path, self._owner)
 
     @functools.cached_property
+    def _endless(self) -> PerformativeProblem | None:
+        return endless(self.problem)
+
+    @functools.cached_property
     def _owner(self) -> dict[str, str]:
         return {name: fingerprint(getattr(self, name)) for name in ("problem", "solver", "gate")}
 
@@ -222,7 +226,7 @@ class Controller:
                 "state", "one begun without a gate", "carry what the gate goes by", "Begin with this controller's init."
             )
         size = float(size_of(self.solver.step_size, jnp.asarray(state.learner.own.count)))
-        return self.gate.refuses(self.problem, state.limits, iterate(after), state.deployed, size)
+        return self.gate.refuses(self.problem, self._endless, state.limits, iterate(after), state.deployed, size)
 
     def _read(self, name: str, value: Any, shape: tuple[int, ...], labels: tuple[str, ...]) -> Any:
         if not (isinstance(value, np.ndarray) and value.dtype == self._dtype and np.isfinite(value).all()):

@@ -100,18 +100,26 @@ class Gate:
         return Limits(cost, step, refusal)
 
     def refuses(
-        self, problem: PerformativeProblem, limits: Limits, candidate: Numbers, deployed: Numbers, size: float
+        self,
+        problem: PerformativeProblem,
+        unending: PerformativeProblem | None,
+        limits: Limits,
+        candidate: Numbers,
+        deployed: Numbers,
+        size: float,
     ) -> list[str]:
-        """Why the candidate, reached by a step of that size, may not follow the deployed policy; empty if it may."""
+        """Why the candidate, reached by a step of that size, may not follow the deployed policy; empty if it may.
+
+        `unending` is `endless(problem)`.
+        """
         reasons = [] if limits.refusal is None else [limits.refusal]
         if limits.step is not None and limits.refusal is None and size > limits.step:
             reasons.append(f"its step size {size:.3g} is above the safe step {limits.step:.3g}")
         if limits.cost is not None and not (cost := predicted(problem, candidate)) <= limits.cost:
             reasons.append(f"its predicted cost {cost:.4g} is above the limit {limits.cost:.4g}")
-        model = None if self.radius is None else endless(problem)
-        if self.radius is not None and model is not None:
-            radius = float(mean_square_radius(model, candidate))
-            if not (radius < self.radius or radius <= float(mean_square_radius(model, deployed))):
+        if self.radius is not None and unending is not None:
+            radius = float(mean_square_radius(unending, candidate))
+            if not (radius < self.radius or radius <= float(mean_square_radius(unending, deployed))):
                 reasons.append(
                     f"its world has a mean-square radius of {radius:.4g}, and {self.radius:.4g} is the limit"
                 )
