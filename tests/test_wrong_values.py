@@ -296,6 +296,16 @@ WRONG = {
             "SampledPerturbation",
         ),
     },
+    "environments": {
+        "no copy": (lambda: pc.environments.VectorPerformativeLDS(0), "num_envs", "at least 1"),
+        "unknown actions": (lambda: pc.environments.PerformativeLDS(actions="forces"), "actions", "'forces'"),
+        "no problem": (lambda: pc.environments.PerformativeLDS(3), "problem", "got int"),
+        "no end": (
+            lambda: pc.environments.PerformativeLDS(build(horizon=inf)),
+            "problem",
+            "problem.truncated(T)",
+        ),
+    },
     "data": {
         "numbers": (lambda: pc.Logs(1, 2, 3), "x", "(episode, time, state)"),
         "states not a number": (lambda: pc.Logs(DATA[0] * nan, *DATA[1:]), "x", "nan"),

@@ -1,5 +1,6 @@
 """Every public name, as `import perfcontrol as pc` offers them."""
 
+import perfcontrol.environments as environments
 import perfcontrol.experiments as experiments
 import perfcontrol.online as online
 from perfcontrol._cache import cache
@@ -202,6 +203,7 @@ __all__ = [
     "certify",
     "confidence_region",
     "design_gain",
+    "environments",
     "estimate_cost",
     "estimate_response",
     "estimate_sensitivity",
