@@ -4,6 +4,7 @@ import json
 
 import cvxpy
 import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -195,6 +196,51 @@ def test_command_gives_the_same_numbers_as_the_library(tmp_path):
     assert data["out_of_sample"]["equal weight"] | {"ratio": 1.0, "windows": 2} == data["out_of_sample"]["equal weight"]
     assert len(data["windows"]) == 2 and data["windows"][1]["last_day"] == data["last_day"]
     assert "spectral radius" in data["certificate"] and data["capital_sweep"] is None
+
+
+def test_command_writes_data_tables_and_figures(tmp_path):
+    values = prices(5, days=121)
+    path, out = tmp_path / "prices.csv", tmp_path / "deep" / "out"
+    path.write_text("\n".join(lines(values)))
+    arguments = ["--horizon", "8", "--window", "80", "--windows", "2", "--out", str(out)]
+    shown = CliRunner().invoke(app, ["stocks", str(path), *arguments])
+    assert shown.exit_code == 0, shown.stderr
+    figures = {f"{name}.{kind}" for name in ("allocations", "windows", "capital") for kind in ("png", "svg")}
+    assert {file.name for file in out.iterdir()} == {"stocks.json", "stocks.md", "weights.csv", *figures}
+    data = json.loads((out / "stocks.json").read_text())
+    assert [point["capital"] for point in data["capital_sweep"]] == pytest.approx(
+        150 * 10 ** np.arange(-1.5, 1.25, 0.5)
+    )
+    table = [line.split(",") for line in (out / "weights.csv").read_text().splitlines()]
+    assert table[0] == ["stock", *ALLOCATIONS] and [row[0] for row in table[1:]] == data["stocks"]
+    for column, name in enumerate(ALLOCATIONS, 1):
+        weights = [float(row[column]) for row in table[1:]]
+        np.testing.assert_allclose(weights, data["allocations"][name]["weights"], atol=1e-6)
+        cost = f"{data['allocations'][name]['expected_cost']:.4g}"
+        assert f"| {name} | {cost} |" in (out / "stocks.md").read_text()
+        assert name in shown.stdout
+    for name in ("allocations", "windows", "capital"):
+        assert plt.imread(out / f"{name}.png").shape[1] > 900
+
+
+def test_command_shows_where_no_stable_allocation_was_found(tmp_path, monkeypatch):
+    """Weights unknown, no certificate, the other allocations as ever; figures and tables leave it out."""
+    monkeypatch.setattr("perfcontrol.experiments.prices.allocations.StablePoint", lambda tolerance: pc.RRM(1e-14, 1))
+    path, out = tmp_path / "prices.csv", tmp_path / "out"
+    path.write_text("\n".join(lines(prices(5, days=121))))
+    arguments = ["--horizon", "8", "--window", "80", "--windows", "1", "--json", "--out", str(out)]
+    result = CliRunner().invoke(app, ["stocks", str(path), *arguments])
+    assert result.exit_code == 0, result.stderr
+    data = json.loads(result.stdout)
+    assert data["allocations"]["stable"] == {"weights": [None] * 3, "expected_cost": None}
+    assert data["certificate"] is None and data["rate"] is None
+    assert data["out_of_sample"]["stable"] == dict.fromkeys(data["out_of_sample"]["stable"]) | {
+        "windows": 0,
+        "cheaper": 0,
+    }
+    assert data["out_of_sample"]["optimal"]["windows"] == 1
+    assert "No stable policy was found." in (out / "stocks.md").read_text()
+    assert (out / "weights.csv").read_text().splitlines()[1].split(",")[4] == ""
 
 
 REFUSED = {

@@ -99,10 +99,16 @@ def _date(option: str, text: str | None) -> datetime.date | None:
 
 def _write(found: "Study", out: Path) -> list[Path]:
     from perfcontrol import results
+    from perfcontrol.plotting.market_figures import figure_allocations, figure_capital, figure_windows
+    from perfcontrol.report.market import markdown, weights_csv
 
     with in_words(f"write to {out}"):
         results.save_json(found.data(), out / "stocks.json")
-        return [out / "stocks.json"]
+        results.save_text(markdown(found), out / "stocks.md")
+        results.save_text(weights_csv(found), out / "weights.csv")
+        files = [out / "stocks.json", out / "stocks.md", out / "weights.csv"]
+        files += figure_allocations(found, out / "allocations") + figure_windows(found, out / "windows")
+        return files + (figure_capital(found, out / "capital") if found.sweep is not None else [])
 
 
 def _show(found: "Study") -> None:
@@ -117,8 +123,10 @@ def _show(found: "Study") -> None:
     console.print(held)
     count = len(found.windows.first)
     costs = Table(
-        "allocation", "expected cost", "mean cost", "against equal weight", "cheaper in", "realised / expected",
+        "allocation", "expected cost", "mean cost", "ratio", "cheaper", "calibration",
         title=f"Costs: expected from now on, and realised in {count} windows out of sample",
+        caption="Realised costs: mean, ratio to equal weight (geometric mean), in how many windows cheaper than it; "
+        "calibration: realised / expected (median).",
     )  # fmt: skip
     for name, row in summary.items():
         expected = shown(found.now.costs[name])
