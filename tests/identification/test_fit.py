@@ -147,6 +147,16 @@ def test_auto_takes_deployments_of_one_episode_each() -> None:
     assert fit.mean_features.name == "constant" and fit.scale_features.name in ("norm", "squared norm")
 
 
+@pytest.mark.parametrize("seed", [1, 3, 8])  # 3: rough squares say that the noise has no variance along one direction
+def test_noise_that_is_nearly_singular_does_not_lead_the_fit_astray(seed: int) -> None:
+    along = np.array([0.55, 0.44])
+    world = WORLD.but(noise=np.outer(along, along) + 3e-4 * np.eye(2))
+    fit = fitted(pc.Logs(*world.logs(seed, small_policies(), 10, 15)), reaction={"mean": "constant", "scale": "norm"})
+    assert np.abs(np.asarray(fit.scale.mean) - [[0.2, 0.4]]).max() < 0.1
+    smallest = np.linalg.eigvalsh(np.asarray(fit.noise_covariance.mean))[0]
+    assert 2e-4 < smallest < 4e-4
+
+
 def test_own_features_give_the_fit_of_the_feature_that_they_equal() -> None:
     own = fitted(reaction=lambda M: jnp.sum(M**2)[None])
     known = fitted(reaction="squared norm")

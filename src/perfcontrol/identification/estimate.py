@@ -8,11 +8,19 @@ from perfcontrol.identification.blocks import Block
 from perfcontrol.identification.covariance import scale_fit, variances
 from perfcontrol.identification.joint import Joint, joint_scoring
 from perfcontrol.identification.location import Location, jacobian, least_squares, reweighted
-from perfcontrol.identification.moments import covariance_sums, covariances, images_of, inverse_factors, mean_sums
+from perfcontrol.identification.moments import (
+    FLOOR,
+    covariance_sums,
+    covariances,
+    images_of,
+    inverse_factors,
+    mean_sums,
+)
 from perfcontrol.identification.transitions import Transitions
 
 ROUNDS = 12
 SETTLED = 1e-7
+LEAST = 0.25  # of the noise of the round before, in every direction
 
 
 class Moments(NamedTuple):
@@ -61,12 +69,22 @@ def moments(
         here = here._replace(location=reweighted(data, here.location, whiten))
         sums = covariance_sums(data, here.residual(data), whiten, images).by_group(data.group, len(scale_features))
         noise, scales = scale_fit(sums, n, scale_features, variances(sums, n))
+        noise = _damped(noise, here.noise)
         V = covariances(data, noise, (scale_features @ scales.T) ** 2, images)
         moved = np.linalg.norm(V - here.V) / np.linalg.norm(V)
         here = Moments(here.location, noise, scales, V)
         if moved <= SETTLED:
             break
     return here
+
+
+def _damped(noise: np.ndarray, before: np.ndarray) -> np.ndarray:
+    """`noise`, in no direction below a share of what it was: rough squares may say none, and weigh without bounds."""
+    root = np.linalg.cholesky(before + FLOOR * max(float(np.trace(before)), np.finfo(float).tiny) * np.eye(len(before)))
+    relative = np.linalg.solve(root, np.linalg.solve(root, noise).T)
+    values, vectors = np.linalg.eigh((relative + relative.T) / 2)
+    side = root @ vectors * np.sqrt(np.maximum(values, LEAST))
+    return side @ side.T
 
 
 def estimated(
