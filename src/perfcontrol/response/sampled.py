@@ -53,7 +53,7 @@ class Averages(eqx.Module):
     covariance: Numbers
 
 
-def _mean(world: Sampled, one: Any, like: Any) -> Any:
+def average(world: Sampled, one: Any, like: Any) -> Any:
     """The mean of `one(key of a path)` over the paths, `LANES` at a time; any number of them without recompilation."""
 
     def block(index: Array, total: Any) -> Any:
@@ -88,7 +88,7 @@ def averages(world: Sampled, M: Any, deployed: Any) -> Averages:
         return cost, slope, jax.vmap(push)(directions), jnp.outer(slope, slope)
 
     square = jnp.zeros((M.size, M.size), M.dtype)
-    cost, slope, hessian, second = _mean(world, one, (square[0, 0], square[0], square, square))
+    cost, slope, hessian, second = average(world, one, (square[0, 0], square[0], square, square))
     return Averages(cost, slope.reshape(M.shape), (hessian + hessian.T) / 2, second - jnp.outer(slope, slope))
 
 
@@ -110,7 +110,7 @@ def reaction(world: Sampled, M: Any, deployed: Any) -> Array:
 
         return jax.jacfwd(gradient)(deployed).reshape(M.size, M.size)
 
-    return _mean(world, one, jnp.zeros((M.size, M.size), M.dtype))
+    return average(world, one, jnp.zeros((M.size, M.size), M.dtype))
 
 
 def _model(world: Sampled, at: Averages, M: Any, damping: Any = 0) -> Affine | Projected:
@@ -238,8 +238,7 @@ class Uncertainty(NamedTuple):
 def uncertainty(world: Sampled, M: Any, deployed: Any = None) -> Uncertainty:
     """That of a best response to `deployed`; without it that of a stable policy, which its own reaction amplifies.
 
-    A fixed point moves by (I - Φ')⁻¹ times what the best response moves. The radius takes ‖error‖² for a multiple of
-    a χ² of the same mean and variance (Satterthwaite), with the quantile of Wilson and Hilferty.
+    A fixed point moves by (I - Φ')⁻¹ times what the best response moves.
     """
     xp, _ = numerics(world, M, deployed)
     reacting = M if deployed is None else deployed
@@ -251,6 +250,16 @@ def uncertainty(world: Sampled, M: Any, deployed: Any = None) -> Uncertainty:
     if deployed is None:
         slope = model.jacobian(M, reaction(world, M, reacting))
         factor = solve(xp.eye(M.size, dtype=M.dtype) - slope, factor)
+    return spread(factor, M)
+
+
+def spread(factor: Any, M: Any) -> Uncertainty:
+    """The uncertainty of a policy M whose covariance is factor factorᵀ, factor (p, p).
+
+    The radius takes ‖error‖² for a multiple of a χ² of the same mean and variance (Satterthwaite), with the quantile
+    of Wilson and Hilferty.
+    """
+    xp, _ = numerics(factor)
     covariance = factor @ factor.T
     trace, square = xp.trace(covariance), xp.sum(covariance**2)
     trace_or_one = xp.where(trace > 0, trace, 1)

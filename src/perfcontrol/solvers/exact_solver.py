@@ -8,7 +8,7 @@ from perfcontrol._checks import check_integer, check_key, check_positive_toleran
 from perfcontrol.evaluate.loop import require_moments
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.response.estimate import TOLERANCE, SampleAverage, as_sampling, is_exact
-from perfcontrol.response.sampled import Sampled
+from perfcontrol.response.sampled import Sampled, Uncertainty, uncertainty
 from perfcontrol.solvers.base import AbstractSolver
 from perfcontrol.solvers.sampled_run import SampledRun
 
@@ -45,6 +45,14 @@ class AbstractExactSolver(AbstractSolver):
         if key is None or is_exact(problem):
             return self
         return SampledRun(self, check_key(key), self.tolerance, self.sampling)
+
+    def sampled(self, problem: PerformativeProblem, key: Any, samples: Any, M: Any) -> Sampled:
+        """The world of sample averages that the method works in, when it sets out from M."""
+        return Sampled(problem, key, samples)
+
+    def uncertainty(self, world: Any, M: Any) -> Uncertainty:
+        """Of the answer M in such a world."""
+        return uncertainty(world, M)
 
     def check(self, problem: PerformativeProblem) -> None:
         require_moments(problem)

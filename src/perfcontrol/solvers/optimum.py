@@ -11,14 +11,18 @@ import jax
 import numpy as np
 from jaxtyping import Array
 
-from perfcontrol._checks import check_integer, check_tolerance
+from perfcontrol._checks import check_integer
 from perfcontrol._linalg import frobenius, solve
 from perfcontrol._programs import Numbers, choose, cond, numerics, on_host, program
-from perfcontrol.evaluate.exact import total_hessian, value_and_total_gradient, values_and_total_gradients
+from perfcontrol.evaluate import exact
 from perfcontrol.problem import PerformativeProblem
-from perfcontrol.response import residual_of, respond, step_of
+from perfcontrol.response import foresight, residual_of, respond
+from perfcontrol.response import step_of as exact_step
+from perfcontrol.response.estimate import SampleAverage
+from perfcontrol.response.foresight import Foreseen
 from perfcontrol.response.projected import nearest, projection_slope
 from perfcontrol.response.quadratic import DENSE_LIMIT
+from perfcontrol.response.sampled import Uncertainty
 from perfcontrol.solvers.base import State, start
 from perfcontrol.solvers.descent import descend
 from perfcontrol.solvers.exact_solver import AbstractExactSolver
@@ -30,6 +34,7 @@ DESCENT = 200  # steps of descent from every start
 FURTHER = 50  # steps of descent where a Newton step does not help
 ROUGHLY = 1e-4  # relative moves at which descent hands over
 COST_NOISE = 0.01  # rounding of a cost relative to √eps: costs cancel, and leaving the set by rounding moves them
+RETRAININGS = 5
 LEAST = 3  # starts: M_0, the stable and the naive policy
 
 
@@ -44,19 +49,23 @@ class _Own(eqx.Module):
 class PerformativeOptimum(AbstractExactSolver):
     """M^PO = argmin over the feasible set of C_T(M; M), by the exact total derivative from several starts.
 
-    Needs a quadratic cost and known moments. The answer never costs more than the start, the stable policy (or where
-    `StablePoint` ends in search of it) or the naive one, Φ(M_0). It is stationary; that it is the cheapest of all
+    Exact for a quadratic cost and known moments; else given a key, by sample averages with common random numbers (where
+    only the probabilities of draws move, as in `FinitePerturbation`, by weighing them). The answer never costs more
+    than the start, the stable policy (or where `StablePoint` ends in search of it) or the naive one, Φ(M_0), exactly or
+    on the sample. It is stationary; that it is the cheapest of all
     is what `pc.optimality_bound` can prove. `.stats`: `cost` C_T(M; M), `residual` (relative natural residual of the
     total gradient), `unique` (whether the answer is an isolated stationary policy; with more than 2048 free
     parameters, where no Hessian is held, always True).
 
     Args:
         starts: how many policies to descend from; M_0, the stable and the naive policy are always among them.
-        tolerance: of the residual; None for 1e-11 in float64, 1e-5 in float32.
+        tolerance: of the residual; None for 1e-11 in float64, 1e-5 in float32; of sampled answers the relative standard
+            error, None for 1e-2.
         max_steps: at most so many Newton steps.
+        sampling: how many paths sampled costs may use; None for `SampleAverage()`.
 
     Raises:
-        InputError: starts < 1; cost or perturbation without closed moments.
+        InputError: starts < 1; cost or perturbation without closed moments, and no key.
 
     References:
         Not in the paper beyond its definition (POC); docs: theory, "The performative optimum".
@@ -64,24 +73,36 @@ class PerformativeOptimum(AbstractExactSolver):
 
     starts: int = eqx.field(static=True)
 
-    def __init__(self, starts: int = 8, tolerance: float | None = None, max_steps: int = 60):
-        super().__init__(tolerance, max_steps)
+    def __init__(
+        self,
+        starts: int = 8,
+        tolerance: float | None = None,
+        max_steps: int = 60,
+        sampling: SampleAverage | None = None,
+    ):
+        super().__init__(tolerance, max_steps, sampling)
         self.starts = check_integer("starts", starts, 1)
+
+    def sampled(self, problem: PerformativeProblem, key: Any, samples: Any, M: Any) -> Foreseen:
+        return Foreseen(problem, key, samples, M)
+
+    def uncertainty(self, world: Any, M: Any) -> Uncertainty:
+        return foresight.uncertainty(world, M)
 
     def init(self, problem: PerformativeProblem, M0: Any) -> State:
         points = _starts(problem, M0, max(self.starts, LEAST))
         xp, _ = numerics(problem, points)
         scale = xp.max(xp.sqrt(xp.sum(points**2, axis=(1, 2, 3))))
         scale = xp.where(scale > 0, scale, 1)
-        best, value, gradient = _descended(problem, points, step_of(problem, M0), scale, ROUGHLY, DESCENT)
-        return start(M0, _Own(best, value, gradient, step_of(problem, best), scale))
+        best, value, gradient = _descended(problem, points, _step_of(problem, M0), scale, ROUGHLY, DESCENT)
+        return start(M0, _Own(best, value, gradient, _step_of(problem, best), scale))
 
     def step(self, problem: PerformativeProblem, state: State, key: Any) -> State:
         own = state.own
         xp, _ = numerics(problem, state)
         M, value, gradient = own.best, own.value, own.gradient
         finite = xp.isfinite(value)
-        tolerance = check_tolerance(self.tolerance, state.M.dtype)
+        tolerance = self.accuracy(problem)
         gap = frobenius(_gap(problem, M, gradient, own.step))
         rounding = COST_NOISE * xp.sqrt(xp.finfo(gap.dtype).eps) * xp.abs(value)
         lengths = xp.asarray([0.25**i for i in range(max(self.starts, LEAST))], M.dtype)
@@ -115,11 +136,12 @@ class PerformativeOptimum(AbstractExactSolver):
 
     def finish(self, problem: PerformativeProblem, state: State, stopped: bool) -> tuple[Result, dict[str, Any]]:
         M = state.M
-        cost, gradient = value_and_total_gradient(problem, M)
-        residual = residual_of(problem, M, M, gradient)
+        values, gradients = _values_and_gradients(problem, M[None])
+        cost, gradient = values[0], gradients[0]
+        residual = _residual(problem, M, gradient, state.own.step)
         unfinished = Result.running if stopped else Result.not_converged
         failed = choose(state.result == Result.nonfinite, Result.nonfinite, unfinished)
-        result = choose(residual <= check_tolerance(self.tolerance, state.M.dtype), Result.success, failed)
+        result = choose(residual <= self.accuracy(problem), Result.success, failed)
         xp, _ = numerics(problem, M)
         unique = xp.asarray(True)
         if M.size <= DENSE_LIMIT:
@@ -129,13 +151,36 @@ class PerformativeOptimum(AbstractExactSolver):
         return result, {"cost": cost, "residual": residual, "unique": unique}
 
 
+def _values_and_gradients(problem: PerformativeProblem, policies: Any) -> tuple[Any, Any]:
+    """C_T(M; M) and its total derivative at stacked policies, exactly or by sample averages."""
+    known = foresight.values_and_gradients if isinstance(problem, Foreseen) else exact.values_and_total_gradients
+    return known(problem, policies)
+
+
+def _hessian(problem: PerformativeProblem, M: Any) -> Any:
+    return foresight.curvature(problem, M)[0] if isinstance(problem, Foreseen) else exact.total_hessian(problem, M)
+
+
+def _step_of(problem: PerformativeProblem, M: Any) -> Any:
+    return foresight.step_of(problem, M) if isinstance(problem, Foreseen) else exact_step(problem, M)
+
+
+def _residual(problem: PerformativeProblem, M: Any, gradient: Any, step: Any) -> Any:
+    """The relative natural residual of the total gradient."""
+    if not isinstance(problem, Foreseen):
+        return residual_of(problem, M, M, gradient)
+    size = frobenius(M)
+    xp, _ = numerics(problem, M)
+    return frobenius(_gap(problem, M, gradient, step)) / xp.where(size > 0, size, 1)
+
+
 def _starts(problem: PerformativeProblem, M0: Any, count: int) -> Any:
     """M_0, the stable policy, the naive one, and others about them; projected, (count, ...)."""
-    stable = run(problem, StablePoint(), M0, throw=False).M
     naive = respond(problem, M0).M
+    stable = _retrained(problem, naive) if isinstance(problem, Foreseen) else _stable(problem, M0)
     stable, naive = on_host((stable, naive))
     xp, _ = numerics(problem, M0, stable, naive)
-    naive = xp.where(xp.all(xp.isfinite(naive)), naive, M0)
+    naive, stable = (xp.where(xp.all(xp.isfinite(M)), M, M0) for M in (naive, stable))
     size = xp.maximum(frobenius(stable), frobenius(naive))
     size = xp.where(size > 0, size, 1)
     points = [M0, stable, naive, 0 * M0, naive / 2, stable / 2]
@@ -143,6 +188,18 @@ def _starts(problem: PerformativeProblem, M0: Any, count: int) -> Any:
         wave = xp.cos(xp.pi * k * (xp.arange(M0.size, dtype=M0.dtype) + 0.5) / M0.size)
         points.append(((-1) ** k * size * wave / frobenius(wave)).reshape(M0.shape))
     return _feasible(problem, xp.stack(points[:count]).astype(M0.dtype))
+
+
+def _stable(problem: PerformativeProblem, M0: Any) -> Any:
+    return run(problem, StablePoint(), M0, throw=False).M
+
+
+def _retrained(problem: Foreseen, naive: Any) -> Any:
+    """Where a few best responses lead: near the stable policy of the sample."""
+    M = naive
+    for _ in range(RETRAININGS):
+        M = respond(problem, M).M
+    return M
 
 
 @program
@@ -155,7 +212,7 @@ def _descent(
     problem: PerformativeProblem, points: Any, first_step: Any, scale: Any, tolerance: Any, limit: Any
 ) -> tuple[Array, Array, Array]:
     def objective(policies: Array) -> tuple[Array, Array]:
-        return values_and_total_gradients(problem, policies)
+        return _values_and_gradients(problem, policies)
 
     return descend(objective, problem.feasible_set.project, points, first_step, scale, tolerance, limit)
 
@@ -182,7 +239,7 @@ def _newton_system(problem: PerformativeProblem, M: Any, gradient: Any, step: An
     slope = projection_slope(problem.feasible_set, M - step * gradient)
     xp, _ = numerics(slope)
     eye = xp.eye(M.size, dtype=M.dtype)
-    return eye - slope @ (eye - step * total_hessian(problem, M))
+    return eye - slope @ (eye - step * _hessian(problem, M))
 
 
 def _trials(problem: PerformativeProblem, M: Any, gradient: Any, step: Any, lengths: Any) -> tuple[Any, Any, Any]:
@@ -194,4 +251,4 @@ def _trials(problem: PerformativeProblem, M: Any, gradient: Any, step: Any, leng
         direction = -solve(_newton_system(problem, M, gradient, step), gap.reshape(-1)).reshape(M.shape)
     direction = xp.where(xp.all(xp.isfinite(direction)), direction, -gap)
     trials = _feasible(problem, M + lengths[:, None, None, None] * direction)
-    return trials, *values_and_total_gradients(problem, trials)
+    return trials, *_values_and_gradients(problem, trials)

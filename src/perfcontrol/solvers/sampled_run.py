@@ -5,16 +5,19 @@ from typing import Any
 import equinox as eqx
 from jaxtyping import Array, Key
 
+from perfcontrol._linalg import frobenius
 from perfcontrol._programs import Numbers, choose, cond, numerics
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.response.estimate import SampleAverage, check_sampling, excess
-from perfcontrol.response.sampled import Sampled, uncertainty
+from perfcontrol.response.foresight import Foreseen
+from perfcontrol.response.sampled import Sampled
 from perfcontrol.solvers.base import AbstractSolver, State, start
 from perfcontrol.solvers.result import Result
 
 
 class _Own(eqx.Module):
     inner: State
+    origin: Numbers  # where the inner run set out
     samples: Numbers
     standard_error: Numbers  # policy_shape
     radius: Numbers
@@ -30,7 +33,7 @@ class SampledRun(AbstractSolver):
         sampling: sizes of samples.
     """
 
-    solver: AbstractSolver
+    solver: Any  # an AbstractExactSolver
     key: Key[Array, ""]
     tolerance: float | None = eqx.field(static=True)
     sampling: SampleAverage
@@ -55,13 +58,13 @@ class SampledRun(AbstractSolver):
         check_sampling(problem, self.tolerance)
 
     def _world(self, problem: PerformativeProblem, own: _Own) -> Sampled:
-        return Sampled(problem, self.key, own.samples)
+        return self.solver.sampled(problem, self.key, own.samples, own.origin)
 
     def init(self, problem: PerformativeProblem, M0: Any) -> State:
         xp, _ = numerics(M0)
         samples, far = xp.asarray(self.sampling.samples), xp.full(M0.shape, xp.inf, M0.dtype)
-        inner = self.solver.init(Sampled(problem, self.key, samples), M0)
-        return start(M0, _Own(inner, samples, far, far.reshape(-1)[0]))
+        inner = self.solver.init(self.solver.sampled(problem, self.key, samples, M0), M0)
+        return start(M0, _Own(inner, M0, samples, far, far.reshape(-1)[0]))
 
     def step(self, problem: PerformativeProblem, state: State, key: Any) -> State:
         own = state.own
@@ -76,18 +79,21 @@ class SampledRun(AbstractSolver):
         xp, _ = numerics(problem, state)
         result, _ = self.solver.finish(world, own.inner, False)
         well = result == Result.success
-        error = uncertainty(world, M)
+        error = self.solver.uncertainty(world, M)
         over = xp.where(error.total > 0, excess(error, M, self.tolerance), 0)
         # Without an error to go by, as where I - Φ' is singular, more samples are all that can help.
         grows = well & ~(over <= 1) & (own.samples < self.sampling.limit)
         samples = xp.where(
             grows, self.sampling.following(own.samples, xp.where(xp.isfinite(over), over, 1)), own.samples
         )
-        again = self.solver.init(self._world(problem, eqx.tree_at(lambda o: o.samples, own, samples)), M)
+        # Weighed draws are made where the run set out: an answer elsewhere than there is checked with draws of its own.
+        away = frobenius(M - own.origin) > error.total
+        again = grows | (well & (over <= 1) & away) if isinstance(world, Foreseen) and world.weighed else grows
+        anew = self.solver.init(self.solver.sampled(problem, self.key, samples, M), M)
         ended = choose(well & ~(over <= 1), Result.undersampled, result)
-        inner = choose(grows, again, own.inner)
-        kept = _Own(inner, samples, error.standard_error, error.radius)
-        return State(M, state.steps, choose(grows, Result.running, ended), kept)
+        inner, origin = choose(again, (anew, M), (own.inner, own.origin))
+        kept = _Own(inner, origin, samples, error.standard_error, error.radius)
+        return State(M, state.steps, choose(again, Result.running, ended), kept)
 
     def finish(self, problem: PerformativeProblem, state: State, stopped: bool) -> tuple[Result, dict[str, Any]]:
         own = state.own
