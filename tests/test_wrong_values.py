@@ -58,6 +58,7 @@ WRONG = {
         "indefinite weight": (lambda: pc.design_gain(system, Q=-eye, R=eye), "Q", "semidefinite"),
         "weight of no input": (lambda: pc.design_gain(system, Q=eye, R=0 * eye), "R", "positive definite"),
         "gain for another system": (lambda: pc.strong_stability(system, np.zeros((2, 3))), "K", "(2, 3)"),
+        "no equilibrium": (lambda: pc.linearise(lambda x, u: x + 1.0, [0.0], [0.0]), "state", "equilibrium"),
         "policy without lags": (lambda: pc.DisturbanceAction(np.zeros((2, 2)), np.zeros((2, 2))), "M", "(H, m, n)"),
     },
     "problem": {
@@ -332,6 +333,8 @@ GIVEN_BACK = {
     "ConfidenceRegion",
     "Estimate",
     "Fit",
+    "Linearisation",
+    "LinearisationError",
     "OptimalityBound",
     "PriceOfStability",
     "Decision",

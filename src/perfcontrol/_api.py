@@ -94,7 +94,14 @@ from perfcontrol.solvers import (
     confidence_region,
     solve,
 )
-from perfcontrol.systems import LinearSystem, UnstableGainWarning, design_gain
+from perfcontrol.systems import (
+    Linearisation,
+    LinearisationError,
+    LinearSystem,
+    UnstableGainWarning,
+    design_gain,
+    linearise,
+)
 from perfcontrol.theory import (
     AbstractCertificateKind,
     Certificate,
@@ -159,6 +166,8 @@ __all__ = [
     "Linear",
     "LinearExponential",
     "LinearSystem",
+    "Linearisation",
+    "LinearisationError",
     "LogCosh",
     "LogNormal",
     "Logs",
@@ -212,6 +221,7 @@ __all__ = [
     "expected_gradient",
     "experiments",
     "fit",
+    "linearise",
     "online",
     "optimality_bound",
     "path_gradient",
