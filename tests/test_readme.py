@@ -34,6 +34,8 @@ def test_readme_example_finds_the_stable_policy() -> None:
     ]
     found = [price.cost_stable, price.cost_optimal, price.cost_naive]
     assert [round(cost, 1) for cost in found] == printed
+    proved = float(re.search(r"costs less than (\S+), which is proved", text).group(1))
+    assert proved <= price.bound.lower < proved + 0.1
 
 
 def test_readme_links_lead_to_files() -> None:

@@ -255,6 +255,7 @@ WRONG = {
         "no gap": (lambda: pc.optimality_bound(problem, gap=0.0), "gap", "gap=1e-3"),
         "no cells": (lambda: pc.optimality_bound(problem, max_cells=0), "max_cells", "at least 1"),
         "price from no start": (lambda: pc.price_of_stability(problem, starts=0), "starts", "at least 1"),
+        "price with no gap left": (lambda: pc.price_of_stability(problem, gap=0.0), "gap", "1e-3"),
         "policy before of another shape": (
             lambda: pc.price_of_stability(problem, deployed_before=np.zeros((2, 2))),
             "deployed_before",

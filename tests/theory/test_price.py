@@ -9,6 +9,8 @@ import pytest
 import scipy.optimize
 
 import perfcontrol as pc
+from perfcontrol.theory import price as price_module
+from perfcontrol.theory.price import in_figures
 from tests.oracles import performative_optima
 from tests.oracles.enumeration import enumerate_cost
 from tests.solvers.test_long_run import CENTRE, HEIGHT, WIDTH, F, belt, belt_response
@@ -62,7 +64,7 @@ def test_price_is_that_of_the_published_closed_forms(case):
 def test_paragraph_says_which_policy_is_cheaper_and_what_foresight_saves():
     saves = pc.price_of_stability(performative_optima.pricing(3.0, 0.8)[0], starts=4)
     assert saves.cost_naive > saves.cost_stable
-    for words in ("more than the stable one: retraining lowers the cost", "not proved", "price of stability is 1.23"):
+    for words in ("more than the stable one: retraining lowers the cost", "not proved", "price of stability is 1.235"):
         assert words in str(saves)
     harms = pc.price_of_stability(performative_optima.location(10.0, 0.4, 0.5)[0], starts=4)
     assert harms.cost_naive < harms.cost_stable
@@ -123,6 +125,35 @@ def test_three_policies_are_those_of_outer_solvers_on_the_enumerated_cost(enumer
     assert_close([price.naive.item(), price.stable.item(), price.optimal.item()], [naive, stable, optimal], 1e-5)
     expected = [_enumerated(M, M) for M in (naive, stable, optimal)]
     assert_close([price.cost_naive, price.cost_stable, price.cost_optimal], expected, 1e-9)
+
+
+def test_proved_interval_holds_the_price_of_a_dense_grid_of_enumerated_costs(enumerable):
+    price = pc.price_of_stability(enumerable, starts=4, gap=1e-4)
+    grid = [_enumerated(M, M) for M in np.linspace(-1.0, 1.0, 2001)]
+    assert price.bound is not None and price.bound.lower <= min(grid) <= price.cost_optimal * (1 + 1e-6)
+    low, high = price.ratio_bound
+    assert low == price.ratio <= price.cost_stable / min(grid) * (1 + 1e-6) and high <= low * (1 + 2e-4)
+    assert f"No policy costs less than {price.bound.lower:.6g} (proved)" in str(price)
+
+
+def test_without_a_gap_nothing_is_proved_and_that_is_said(enumerable):
+    price = pc.price_of_stability(enumerable, starts=4, gap=None)
+    assert price.bound is None and price.ratio_bound is None
+    assert "was not looked into" in str(price)
+
+
+@pytest.mark.parametrize(("ratio", "text"), [(1.0, "1"), (1.2346, "1.235"), (1.0004321, "1.00043"), (7.626, "7.626")])
+def test_ratios_show_what_is_above_one(ratio, text):
+    assert in_figures(ratio) == text
+
+
+def test_cheaper_policy_of_the_bound_is_the_optimal_one(enumerable, monkeypatch):
+    found = pc.price_of_stability(enumerable, starts=4)
+    poor = pc.solve(enumerable, pc.StablePoint())  # as if descent had ended at the stable policy
+    monkeypatch.setattr(price_module, "solve", lambda problem, solver, start, throw: poor)
+    again = pc.price_of_stability(enumerable, starts=4)
+    assert_close(again.optimal, found.optimal, 1e-6)
+    assert again.cost_optimal == again.bound.upper < again.cost_stable - 0.1
 
 
 def test_after_the_stable_policy_the_naive_one_is_the_stable_one(enumerable):

@@ -16,6 +16,7 @@ from perfcontrol.problem import PerformativeProblem, check_problem
 from perfcontrol.response import best_response
 from perfcontrol.solvers import PerformativeOptimum, Result, Solution, StablePoint, solve
 from perfcontrol.solvers.solve import check_feasible
+from perfcontrol.theory.optimality import OptimalityBound, optimality_bound
 from perfcontrol.theory.precision import in_double
 from perfcontrol.theory.stability.stable_policy import find_stable_policy
 
@@ -30,13 +31,13 @@ class PriceOfStability:
     Attributes:
         naive: Φ(deployed_before): the best response in the world before anything reacts.
         stable: M^PS, where retraining from there comes to rest.
-        optimal: the cheapest policy known, by descent from several starts. Never dearer than the other two.
+        optimal: the cheapest policy known: by descent from several starts, or by the bound. Never dearer than those.
         cost_naive: None where the world that the naive policy makes is not mean-square stable (infinite horizon).
         cost_stable: of M^PS.
         cost_optimal: of `optimal`.
         residual: relative natural residual of the total gradient at `optimal`.
         unique: whether the best response to `stable` is the only one.
-        bound: the proved interval of the optimal cost; None where none is known.
+        bound: of `pc.optimality_bound`: the interval of the optimal cost, or why none is proved; None with gap=None.
     """
 
     naive: np.ndarray
@@ -47,12 +48,20 @@ class PriceOfStability:
     cost_optimal: float
     residual: float
     unique: bool
-    bound: Any = None
+    bound: OptimalityBound | None = None
 
     @property
     def ratio(self) -> float | None:
         """The price of stability, cost_stable / cost_optimal; None where the optimal cost is zero."""
         return _ratio(self.cost_stable, self.cost_optimal)
+
+    @property
+    def ratio_bound(self) -> tuple[float, float] | None:
+        """The interval of the price of stability that `bound` proves; None where it proves none."""
+        lower = None if self.bound is None else self.bound.lower
+        if self.ratio is None or lower is None or lower <= 0:
+            return None
+        return self.ratio, max(self.ratio, self.cost_stable / lower)
 
     @property
     def ratio_naive(self) -> float | None:
@@ -99,13 +108,20 @@ class PriceOfStability:
         ended = ""
         if self.residual > STATIONARY:
             ended = f" The search for it had not ended: the residual of the total gradient is {self.residual:.1e}."
-        return f"That no policy is cheaper still is not proved.{ended}"
+        if self.bound is None:
+            return f"That no policy is cheaper still was not looked into.{ended}"
+        if self.bound.lower is None:
+            return f"That no policy is cheaper still is not proved: {'; '.join(self.bound.missing)}.{ended}"
+        interval = ""
+        if self.ratio_bound is not None and not _same(*self.ratio_bound):
+            interval = ", so that the price lies between {} and {}".format(*map(in_figures, self.ratio_bound))
+        return f"No policy costs less than {self.bound.lower:.6g} ({self.bound.status}){interval}.{ended}"
 
 
 def in_figures(ratio: float) -> str:
-    """A ratio with at least two figures of what it has above one."""
+    """A ratio in four figures, or with two of what it has above one."""
     above = ratio - 1
-    return f"{ratio:.{3 if above <= 0 or above >= 0.1 else int(2 - np.floor(np.log10(above)))}g}"
+    return f"{ratio:.{4 if above <= 0 or above >= 0.01 else int(2 - np.floor(np.log10(above)))}g}"
 
 
 def _same(a: float, b: float) -> bool:
@@ -120,7 +136,7 @@ def _ratio(cost: float, optimal: float) -> float | None:
 
 @in_double
 def price_of_stability(
-    problem: PerformativeProblem, *, deployed_before: Any = None, starts: int = 8
+    problem: PerformativeProblem, *, deployed_before: Any = None, starts: int = 8, gap: float | None = 1e-3
 ) -> PriceOfStability:
     """What it costs that retraining comes to rest where nobody wants to move, and not where it is cheapest.
 
@@ -133,6 +149,8 @@ def price_of_stability(
         deployed_before: the policy that the world has seen so far, free parameters; None for 0, or the feasible policy
             nearest to it.
         starts: how many policies the search for the optimum descends from.
+        gap: relative width at which the proved interval of the optimal cost may stop (see `pc.optimality_bound`); None
+            for no proof.
 
     Returns:
         The policies, their costs, differences and ratios; `str()` of it is a paragraph.
@@ -152,12 +170,16 @@ def price_of_stability(
         check_feasible("deployed_before", problem, before)
     naive = best_response(problem, before)
     stable = _stable(problem, before)
+    bound = None if gap is None else optimality_bound(problem, gap)
     optimum = solve(problem, solver, before, throw=False)
     cost_stable, cost_naive = _cost(problem, stable.M), _cost(problem, naive)
     if cost_stable is None:
         raise _no_stable_policy("one whose world is not mean-square stable")
     optimal, cost_optimal = stable.M, cost_stable
-    for other, cost in ((naive, cost_naive), (optimum.M, _cost(problem, optimum.M))):
+    others = [(naive, cost_naive), (optimum.M, _cost(problem, optimum.M))]
+    if bound is not None and bound.M is not None:
+        others.append((bound.M, bound.upper))
+    for other, cost in others:
         if cost is not None and cost < cost_optimal:
             optimal, cost_optimal = other, cost
     return PriceOfStability(
@@ -169,6 +191,7 @@ def price_of_stability(
         cost_optimal=cost_optimal,
         residual=float(optimum.stats["residual"]),
         unique=bool(stable.stats["unique"]),
+        bound=bound,
     )
 
 
