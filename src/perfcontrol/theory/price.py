@@ -176,7 +176,7 @@ def price_of_stability(
     if cost_stable is None:
         raise _no_stable_policy("one whose world is not mean-square stable")
     optimal, cost_optimal = stable.M, cost_stable
-    others = [(naive, cost_naive), (optimum.M, _cost(problem, optimum.M))]
+    others: list[tuple[Any, float | None]] = [(naive, cost_naive), (optimum.M, _cost(problem, optimum.M))]
     if bound is not None and bound.M is not None:
         others.append((bound.M, bound.upper))
     for other, cost in others:
