@@ -22,6 +22,7 @@ from perfcontrol._checks import (
 )
 from perfcontrol._functions import call
 from perfcontrol._linalg import Matrix, along_time
+from perfcontrol._printing import Printed, Row, of_problem
 from perfcontrol.costs import AbstractCost
 from perfcontrol.perturbations import AbstractPerturbation, NoPerturbation, fitted_perturbation
 from perfcontrol.policy_maps import AbstractPolicyMap, as_policy_map
@@ -30,7 +31,7 @@ from perfcontrol.sets import AbstractSet, AbstractStructure, FullStructure, Lift
 from perfcontrol.systems import LinearSystem, warn_of_growth
 
 
-class PerformativeProblem(eqx.Module):
+class PerformativeProblem(Printed, eqx.Module):
     """A linear system whose perturbations react to the deployed disturbance-action policy.
 
     x_{t+1} = A_t x_t + B_t u_t + Δ_t z_t + w_t for t = 0..T-1, Δ_t ~ D_t(deployed policy), z = x (or [x; u]);
@@ -160,6 +161,9 @@ class PerformativeProblem(eqx.Module):
         if isinstance(self.noise, AbstractRandomVector):
             return self.noise
         return call("noise", self.noise, M=deployed).resize(self.state_size)
+
+    def described(self) -> tuple[str, list[Row]]:
+        return of_problem(self)
 
     @property
     def noise_reacts(self) -> bool:

@@ -4,11 +4,17 @@ import abc
 from typing import Any
 
 import equinox as eqx
+import numpy as np
 from jaxtyping import Array
 
-from perfcontrol._programs import Numbers, numerics
+from perfcontrol._printing import Printed, Row, of_solution
+from perfcontrol._programs import Numbers, known, numerics
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.solvers.result import Result
+
+MEMBERS = (
+    Result.success, Result.running, Result.diverged, Result.nonfinite, Result.undersampled, Result.not_converged
+)  # fmt: skip
 
 
 class SolveError(RuntimeError):
@@ -75,7 +81,7 @@ class AbstractSolver(eqx.Module):
         """Result and statistics of the last state; `stopped` says that max_steps of `solve` cut the run short."""
 
 
-class Solution(eqx.Module):
+class Solution(Printed, eqx.Module):
     """What `solve` returns.
 
     Attributes:
@@ -91,6 +97,22 @@ class Solution(eqx.Module):
     steps: Array
     history: Any
     stats: dict[str, Array]
+
+    def described(self) -> tuple[str, list[Row]]:
+        return of_solution(self, self._ended())
+
+    def summary(self) -> str:
+        """What was found, how accurately, after how many steps; of a batch how many runs ended in which way."""
+        return str(self)
+
+    def __str__(self) -> str:
+        return super().__str__() if known(self.M, self.steps, self.stats) else repr(self)
+
+    def _ended(self) -> str:
+        if not self.steps.ndim:
+            return Result[self.result]
+        counts = [(int(np.sum(np.asarray(self.result == member))), Result[member]) for member in MEMBERS]
+        return "; ".join(f"{count} of {self.steps.size}: {text}" for count, text in counts if count)
 
 
 def start(M0: Any, own: Any = None) -> State:
