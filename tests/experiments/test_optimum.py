@@ -7,7 +7,7 @@ import scipy.optimize
 
 import perfcontrol as pc
 from perfcontrol.config import REGIMES
-from perfcontrol.experiments.reproduce.optimum import optimal_policy, symmetric
+from perfcontrol.experiments.reproduce.optimum import lower_bound, optimal_policy, symmetric
 from perfcontrol.experiments.stock import HORIZON, STOCKS, stock_sensitivities
 from tests.tools import assert_close, normal
 
@@ -97,6 +97,17 @@ def test_lower_bound_is_below_every_policy_tried():
         for seed in range(5):
             M = problem.feasible_set.project(spread * normal(seed, *problem.policy_shape))
             assert float(pc.expected_cost(problem, M)) >= cost >= lower
+
+
+@pytest.mark.parametrize("ends", [(-0.9, -0.6), (-0.3, 0.2), (0.1, 0.5), (0.4, 0.41)])
+def test_bound_of_an_interval_is_below_its_costs_and_near_them_where_it_is_short(ends):
+    problem = pc.experiments.stock_market("descending", growth=0.96)
+    costs = [float(pc.expected_cost(problem, symmetric(problem, d))) for d in np.linspace(*ends, 21)]
+    once, _ = lower_bound(problem, ends, -np.inf)
+    rounded = min(costs) * (1 + 1e-12)
+    assert once <= rounded
+    often, cells = lower_bound(problem, ends, 0.99 * min(costs))
+    assert once <= often <= rounded and often >= 0.99 * min(costs) and cells < 100
 
 
 def test_on_the_simplex_nothing_of_the_own_stock_is_bought_and_stable_is_optimal():

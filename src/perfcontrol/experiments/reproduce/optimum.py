@@ -13,7 +13,6 @@ C_T(M(·); M(d')), d' its point nearest to zero. Intervals are halved, that of t
 
 import heapq
 import itertools
-from collections.abc import Callable
 
 import numpy as np
 import xarray
@@ -37,22 +36,23 @@ def symmetric(problem: PerformativeProblem, d: float) -> np.ndarray:
     return others[None]
 
 
+def parabola(problem: PerformativeProblem, deployed: float) -> np.poly1d:
+    """C_T(M(d); M(deployed)) in d, by three evaluations."""
+    world = world_of(problem, symmetric(problem, deployed))
+    points = np.array([-1.0, 0.0, 1.0])
+    values = [float(weigh(problem, world, symmetric(problem, d))[0]) for d in points]
+    return np.poly1d(np.polyfit(points, values, 2))
+
+
 def optimal_policy(problem: PerformativeProblem, gap: float = GAP) -> tuple[float, float, float, int]:
     """The optimal d, its cost, a proved lower bound of what any feasible policy costs, and the intervals used."""
     from scipy.optimize import minimize_scalar
-
-    def parabola(deployed: float) -> np.poly1d:
-        """C_T(M(d); M(deployed)) in d, by three evaluations."""
-        world = world_of(problem, symmetric(problem, deployed))
-        points = np.array([-1.0, 0.0, 1.0])
-        values = [float(weigh(problem, world, symmetric(problem, d))[0]) for d in points]
-        return np.poly1d(np.polyfit(points, values, 2))
 
     def cost(d: float) -> float:
         return float(weigh(problem, world_of(problem, symmetric(problem, d)), symmetric(problem, d))[0])
 
     # Beyond [low, high] even the calmest world is dearer than the policy that spreads everything evenly.
-    calmest, even = parabola(0.0), cost(0.0)
+    calmest, even = parabola(problem, 0.0), cost(0.0)
     low, high = np.sort(np.real((calmest - even).roots))
     if problem.feasible_set.nonnegative:
         total, stocks = float(problem.feasible_set.row_total), problem.policy_shape[1]  # type: ignore[arg-type]
@@ -62,15 +62,15 @@ def optimal_policy(problem: PerformativeProblem, gap: float = GAP) -> tuple[floa
     ends = grid[max(around - 1, 0)], grid[min(around + 1, GRID - 1)]
     found = minimize_scalar(cost, bounds=ends, method="bounded", options={"xatol": 1e-10})
     best = min((0.0, *ends, float(found.x)), key=cost)
-    lower, cells = _lower_bound(parabola, (low, high), cost(best) * (1 - gap))
+    lower, cells = lower_bound(problem, (low, high), cost(best) * (1 - gap))
     return best, cost(best), min(lower, cost(best)), cells
 
 
-def _lower_bound(parabola: Callable[[float], np.poly1d], ends: tuple[float, float], enough: float) -> tuple[float, int]:
-    """The lowest bound over intervals that cover `ends`, halved until it reaches `enough`; how many there were."""
+def lower_bound(problem: PerformativeProblem, ends: tuple[float, float], enough: float) -> tuple[float, int]:
+    """What no M(d) with d in `ends` costs less than, intervals halved until that is `enough`; how many there were."""
 
     def bounded(low: float, high: float) -> tuple[float, float, float]:
-        form = parabola(float(np.clip(0.0, low, high)))
+        form = parabola(problem, float(np.clip(0.0, low, high)))
         lowest = np.clip(-form[1] / (2 * form[2]), low, high) if form[2] > 0 else low
         return min(form(low), form(high), form(lowest)), low, high
 
