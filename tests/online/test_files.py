@@ -187,6 +187,20 @@ def test_failed_save_leaves_the_old_file(tmp_path, monkeypatch):
         assert path.read_bytes() == whole and [p.name for p in tmp_path.iterdir()] == ["plant.npz"]
 
 
+def test_saved_file_is_on_the_disk_before_it_takes_its_place_and_its_folder_after(tmp_path, monkeypatch):
+    c, path = controller(gate=False), tmp_path / "plant.npz"
+    done, fsync, replace = [], os.fsync, os.replace
+
+    def record(handle):
+        done.append(os.fstat(handle).st_ino)
+        fsync(handle)
+
+    monkeypatch.setattr(os, "fsync", record)
+    monkeypatch.setattr(os, "replace", lambda *paths: (done.append("replaced"), replace(*paths)))
+    c.save(c.init(), path)
+    assert done == [path.stat().st_ino, "replaced", tmp_path.stat().st_ino]
+
+
 def scaled(factor):
     return lambda M: factor * jnp.sum(M**2)[None]
 

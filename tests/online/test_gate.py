@@ -59,6 +59,22 @@ def test_step_above_the_safe_step_is_refused_until_it_has_diminished():
     np.testing.assert_allclose(after.deployed, -3 * safe / 3.5 * np.asarray(gradient), rtol=1e-12)
 
 
+def test_safe_step_in_the_long_run_is_that_of_gradients_per_stage():
+    problem = pc.PerformativeProblem(
+        system=pc.LinearSystem([[0.5]], [[1.0]]),
+        horizon=np.inf,
+        noise=pc.Gaussian([0.0], [[1.0]]),
+        cost=pc.QuadraticCost([[1.0]], [[0.1]]),
+        perturbation=pc.DirectionalPerturbation([[[1.0]]], pc.Norm([0.1], [0.2])),
+    )
+    finite = problem.truncated(9)
+    safe = pc.safe_step(finite)
+    limits = pc.online.Gate(certificate=False).limits(problem, pc.RSGD(1, 1.0, truncation=9), np.zeros((1, 1, 1)))
+    ended = pc.solve(finite, pc.RSGD(1, safe), key=key).M
+    np.testing.assert_allclose(pc.solve(problem, pc.RSGD(1, limits.step, truncation=9), key=key).M, ended, rtol=1e-12)
+    assert float(ended[0, 0, 0]) != 0
+
+
 def radius_of(problem, M):
     """ρ(𝒯) by Kronecker products."""
     A, B, K = (np.asarray(matrix) for matrix in (problem.system.A, problem.system.B, problem.gain))
