@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
+from scipy import linalg
 
 
 class Block(NamedTuple):
@@ -14,7 +15,7 @@ class Block(NamedTuple):
 
     def bread(self) -> np.ndarray:
         """Inverse of the information."""
-        return np.linalg.pinv(self.information.sum(axis=0), rcond=1e-12, hermitian=True)
+        return pseudo_inverse(self.information.sum(axis=0))
 
     def covariance(self) -> np.ndarray:
         """The sandwich I⁻¹ (Σ_u s_u s_uᵀ) I⁻¹, robust to unequal variances, times U / (U - 1)."""
@@ -30,5 +31,25 @@ class Block(NamedTuple):
         """The values after one scoring step with weights (k, U) on the units, (k, p)."""
         size = len(self.values)
         information = (weights @ self.information.reshape(len(self.score), -1)).reshape(-1, size, size)
-        inverse = np.linalg.pinv(information, rcond=1e-12, hermitian=True)
-        return self.values + np.einsum("kpq,kq->kp", inverse, weights @ self.score)
+        return self.values + np.einsum("kpq,kq->kp", pseudo_inverse(information), weights @ self.score)
+
+
+def pseudo_inverse(matrix: np.ndarray) -> np.ndarray:
+    """Of positive semidefinite matrices (..., p, p), in columns of unit size."""
+    scale = 1 / np.sqrt(np.maximum(np.diagonal(matrix, axis1=-2, axis2=-1), 1e-300))
+    both = scale[..., :, None] * scale[..., None, :]
+    return both * np.linalg.pinv(matrix * both, rcond=1e-9, hermitian=True)
+
+
+def hidden_directions(information: np.ndarray) -> np.ndarray:
+    """A sparse basis (p, r) of what a positive semidefinite information (p, p) says nothing of."""
+    diagonal = np.diag(information)
+    silent = diagonal <= 1e-30 * diagonal.max(initial=1e-300)
+    scale = 1 / np.sqrt(np.where(silent, 1.0, diagonal))
+    values, vectors = np.linalg.eigh((information * scale * scale[:, None])[~silent][:, ~silent])
+    basis = np.zeros((len(scale), len(scale)))
+    basis[~silent, : len(values)] = vectors
+    basis[silent, len(values) :] = np.eye(int(silent.sum()))
+    null = basis[:, np.append(values < 1e-9 * values.max(initial=0.0), np.ones(int(silent.sum()), bool))]
+    pivots = linalg.qr(null.T, mode="r", pivoting=True)[-1][: null.shape[1]]
+    return scale[:, None] * null @ np.linalg.inv(null[pivots])

@@ -7,6 +7,7 @@ unit if nothing reacts, whatever the policies.
 
 import numpy as np
 
+from perfcontrol.identification.blocks import pseudo_inverse
 from perfcontrol.identification.moments import Sums
 
 
@@ -27,12 +28,6 @@ def estimated_deviations(sums: Sums, group: np.ndarray, functional: np.ndarray) 
         through = own @ functional
         out[:, g] = out[:, g] @ pseudo_inverse(functional.T @ through - through.T @ inverse @ through)
     return out
-
-
-def pseudo_inverse(matrix: np.ndarray) -> np.ndarray:
-    """Of a positive semidefinite matrix, in columns of unit size."""
-    scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    return scale * np.linalg.pinv(matrix * scale * scale[:, None], rcond=1e-9, hermitian=True) * scale[:, None]
 
 
 def centred(contributions: np.ndarray, group: np.ndarray) -> np.ndarray:

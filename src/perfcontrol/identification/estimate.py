@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from perfcontrol.identification.blocks import Block
+from perfcontrol.identification.blocks import Block, hidden_directions
 from perfcontrol.identification.covariance import scale_fit, variances
 from perfcontrol.identification.joint import Joint, joint_scoring
 from perfcontrol.identification.location import Location, jacobian, least_squares, reweighted
@@ -15,6 +15,7 @@ from perfcontrol.identification.moments import (
     images_of,
     inverse_factors,
     mean_sums,
+    upper,
 )
 from perfcontrol.identification.transitions import Transitions
 
@@ -43,11 +44,15 @@ class Moments(NamedTuple):
 
 
 class Estimated(NamedTuple):
-    """Estimates with what every unit contributed: `mean` for the free coefficients of the location, row by row."""
+    """Estimates with what every unit contributed: `mean` for the free coefficients of the location, row by row.
+
+    hidden (P, r): what may be added to noise and scales unseen, where the directions are given.
+    """
 
     location: Location
     mean: Block
     spread: Joint
+    hidden: np.ndarray
 
 
 def moments(
@@ -94,7 +99,25 @@ def estimated(
     here, spread = _refined(data, start, directions, scale_features, free)
     for _ in range(2 * free):
         here, spread = _refined(data, here, spread.directions, scale_features, free)
-    return Estimated(here.location, _mean_block(data, here.location, here.whiten()), spread)
+    block = _mean_block(data, here.location, here.whiten())
+    return Estimated(here.location, block, spread, _hidden(data, here, spread, scale_features, free))
+
+
+def _hidden(data: Transitions, here: Moments, spread: Joint, features: np.ndarray, free: bool) -> np.ndarray:
+    """See `Estimated`. A scale that was found to be zero is moved: its slope vanishes there, its square is seen."""
+    k, width = spread.scales.shape
+    s = len(upper(spread.noise))
+    if free:
+        return np.zeros((s + k * width, 0))
+    sums = covariance_sums(data, here.residual(data), here.whiten(), images_of(data, spread.directions))
+    information = sums.by_group(data.group, len(features)).information
+    eta = np.abs(features @ spread.scales.T)
+    eta = np.maximum(eta, 0.1 * max(float(eta.max(initial=0.0)), 1e-3 * np.sqrt(float(np.trace(spread.noise)))))
+    jacobian = np.zeros((len(features), s + k, s + k * width))
+    jacobian[:, :s, :s] = np.eye(s)
+    for j in range(k):
+        jacobian[:, s + j, s + j * width + np.arange(width)] = 2 * eta[:, j, None] * features
+    return hidden_directions(np.einsum("gpi,gpq,gqj->ij", jacobian, information, jacobian, optimize=True))
 
 
 def _refined(

@@ -15,7 +15,7 @@ from perfcontrol.identification.estimate import Estimated
 from perfcontrol.identification.features import Features
 from perfcontrol.identification.logs import Logs
 from perfcontrol.identification.plant import Coefficients, build, logged_start
-from perfcontrol.identification.readings import MeanReading
+from perfcontrol.identification.readings import HIDDEN, MeanReading
 from perfcontrol.identification.report import paragraph, table
 from perfcontrol.identification.transitions import Transitions
 from perfcontrol.identification.unidentified import Gap, gaps
@@ -72,7 +72,9 @@ class Fit:
         """Cov w_t, (n, n)."""
         spread, n = self.estimated.spread, self.logs.state_size
         errors = np.zeros((n, n))
-        errors[np.triu_indices(n)] = spread.block.standard_errors()[: n * (n + 1) // 2]
+        size = n * (n + 1) // 2
+        told = spread.block.standard_errors()[:size]
+        errors[np.triu_indices(n)] = np.where(self._untold(np.eye(size, len(spread.block.values))), np.inf, told)
         return Estimate(jnp.asarray(spread.noise), jnp.asarray(np.maximum(errors, errors.T)))
 
     @property
@@ -80,14 +82,16 @@ class Fit:
         """Coefficients of the scales, (k, 1+q): scale_k(M) = c_k0 + Σ_j c_kj f_j(M). The sign of a row is arbitrary."""
         scales = self.estimated.spread.scales
         variance = np.einsum("kqkq->kq", self.estimated.spread.scale_covariance())
-        return Estimate(jnp.asarray(scales), jnp.asarray(np.sqrt(variance)))
+        untold = self._untold_scales(np.eye(scales.shape[1])).T
+        return Estimate(jnp.asarray(scales), jnp.asarray(np.where(untold, np.inf, np.sqrt(variance))))
 
     @property
     def deployed_scale(self) -> Estimate:
         """scale(M) at each deployed policy, (G, k)."""
         spread, values = self.estimated.spread, self.scale_features.values(self.data.policies)
         variance = np.einsum("gq,kqkr,gr->gk", values, spread.scale_covariance(), values)
-        return Estimate(jnp.asarray(values @ spread.scales.T), jnp.asarray(np.sqrt(np.maximum(variance, 0))))
+        errors = np.where(self._untold_scales(values), np.inf, np.sqrt(np.maximum(variance, 0)))
+        return Estimate(jnp.asarray(values @ spread.scales.T), jnp.asarray(errors))
 
     @property
     def directions(self) -> Estimate:
@@ -227,6 +231,22 @@ class Fit:
         zero = self.mean_features.values(np.zeros((1, *self.data.policies.shape[1:])))[0]
         width = self.estimated.spread.directions.shape[2]
         return MeanReading(self.estimated.location, self.estimated.mean, self.data.gain, zero, width)
+
+    def _untold_scales(self, values: np.ndarray) -> np.ndarray:
+        """Whether features (V, Q) times the coefficients of each scale are unknown, (V, k)."""
+        n, (k, width) = self.logs.state_size, self.estimated.spread.scales.shape
+        first, functional = n * (n + 1) // 2, np.zeros((len(values), k, len(self.estimated.spread.block.values)))
+        for j in range(k):
+            functional[:, j, first + j * width : first + (j + 1) * width] = values
+        return self._untold(functional)
+
+    def _untold(self, functional: np.ndarray) -> np.ndarray:
+        """Whether functionals (..., P) of noise and scales feel what the logs do not tell."""
+        hidden = self.estimated.hidden
+        if not hidden.shape[1]:
+            return np.zeros(functional.shape[:-1], dtype=bool)
+        size = np.linalg.norm(hidden, axis=0)
+        return np.any(np.abs(functional @ hidden) > HIDDEN * size, axis=-1)
 
     def _gaps(self) -> list[Gap]:
         return gaps(self.data, self.estimated, self.mean_features, self.scale_features)

@@ -7,7 +7,10 @@ import numpy as np
 from perfcontrol.identification.estimate import Estimated
 from perfcontrol.identification.features import Features
 from perfcontrol.identification.location import Location
+from perfcontrol.identification.moments import images_of
 from perfcontrol.identification.transitions import Transitions
+
+SHARE = 1e-3  # of the largest part of what cannot be told, below which a part does not belong to it
 
 
 class Gap(NamedTuple):
@@ -36,6 +39,7 @@ def gaps(data: Transitions, estimated: Estimated, mean: Features, scale: Feature
     if estimated.spread.tangent.shape[-1]:
         text = "the law of the perturbations beyond their second moments: other directions may give the same ones"
         found.append(Gap(text + " (expected costs do not tell them apart)", False))
+    found += split_variances(data, estimated)
     policies = data.policies.reshape(len(data.policies), -1)
     if len(policies) == 1:
         found.append(Gap("any reaction: only one policy was deployed (deploy a second)", False))
@@ -50,6 +54,25 @@ def gaps(data: Transitions, estimated: Estimated, mean: Features, scale: Feature
     if tried < policies.shape[1] and "affine" in (mean.name, scale.name):
         text = f"slopes of the reaction in {policies.shape[1] - tried} of {policies.shape[1]} directions of the policy"
         found.append(Gap(text + ": never tried, taken as zero", False))
+    return found
+
+
+def split_variances(data: Transitions, estimated: Estimated) -> list[Gap]:
+    """Noise and given directions whose squares look alike on the states of these logs."""
+    spread, n = estimated.spread, data.y.shape[1]
+    s = n * (n + 1) // 2
+    found = []
+    for vector in estimated.hidden.T:
+        moved = np.abs(vector[s:]).reshape(spread.scales.shape).max(axis=1, initial=0.0)
+        parts = [f"direction {k + 1}" for k in np.flatnonzero(moved > SHARE * np.abs(vector).max())]
+        with_noise = np.abs(vector[:s]).max(initial=0.0) > SHARE * np.abs(vector).max()
+        if with_noise:
+            parts = ["the noise", *parts]
+        if len(parts) > 1:
+            text = f"how variance is split between {', '.join(parts[:-1])} and {parts[-1]}: their squares look alike"
+            found.append(Gap(text + " on these states (move the states otherwise, or leave one out)", False))
+        elif not with_noise and not np.any(images_of(data, spread.directions)[:, np.argmax(moved)]):
+            found.append(Gap(f"the scale along {parts[0]}: the states never moved what it acts on", False))
     return found
 
 
