@@ -2,6 +2,7 @@
 
 import perfcontrol.environments as environments
 import perfcontrol.experiments as experiments
+import perfcontrol.interop as interop
 import perfcontrol.online as online
 from perfcontrol._cache import cache
 from perfcontrol._calls import explain_calls
@@ -221,6 +222,7 @@ __all__ = [
     "expected_gradient",
     "experiments",
     "fit",
+    "interop",
     "linearise",
     "online",
     "optimality_bound",

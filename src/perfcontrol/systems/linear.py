@@ -15,15 +15,19 @@ class LinearSystem(eqx.Module):
     Args:
         A: (n, n) or (T, n, n).
         B: (n, m) or (T, n, m).
+        state_names: n names of the states, or None.
+        input_names: m names of the inputs, or None.
 
     Raises:
-        InputError: shapes that do not fit, or non-finite entries.
+        InputError: shapes that do not fit, non-finite entries, or names that do not tell all signals apart.
     """
 
     A: Array | Diagonal
     B: Array | Diagonal
+    state_names: tuple[str, ...] | None = eqx.field(static=True)
+    input_names: tuple[str, ...] | None = eqx.field(static=True)
 
-    def __init__(self, A: Any, B: Any):
+    def __init__(self, A: Any, B: Any, state_names: Any = None, input_names: Any = None):
         self.A = A if isinstance(A, Diagonal) else as_array("A", A)
         self.B = B if isinstance(B, Diagonal) else as_array("B", B)
         if self.A.ndim not in (2, 3):
@@ -46,6 +50,9 @@ class LinearSystem(eqx.Module):
                 f"have {self.A.shape[0]} time steps, as A has",
                 "Give both the same length, or one of them constant.",
             )
+
+        self.state_names = _names("state_names", state_names, n)
+        self.input_names = _names("input_names", input_names, self.B.shape[-1])
 
     @classmethod
     def diagonal(cls, a: Any, b: Any) -> "LinearSystem":
@@ -76,3 +83,12 @@ class LinearSystem(eqx.Module):
     def horizon(self) -> int | None:
         """T where a matrix varies in time, else None."""
         return self.A.shape[0] if self.A.ndim == 3 else self.B.shape[0] if self.B.ndim == 3 else None
+
+
+def _names(argument: str, names: Any, count: int) -> tuple[str, ...] | None:
+    if names is None:
+        return None
+    names = (names,) if isinstance(names, str) else tuple(names)
+    if len(names) != count or len(set(names)) < count or not all(isinstance(name, str) for name in names):
+        raise fail(argument, f"{list(names)}", f"be {count} different names", "One text for each signal.")
+    return names
