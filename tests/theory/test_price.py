@@ -133,6 +133,7 @@ def test_proved_interval_holds_the_price_of_a_dense_grid_of_enumerated_costs(enu
     assert price.bound is not None and price.bound.lower <= min(grid) <= price.cost_optimal * (1 + 1e-6)
     low, high = price.ratio_bound
     assert low == price.ratio <= price.cost_stable / min(grid) * (1 + 1e-6) and high <= low * (1 + 2e-4)
+    assert high == pytest.approx(price.cost_stable / price.bound.lower, rel=1e-14) and high > low
     assert f"No policy costs less than {price.bound.lower:.6g} (proved)" in str(price)
 
 
