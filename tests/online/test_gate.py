@@ -7,6 +7,7 @@ import pytest
 
 import perfcontrol as pc
 from perfcontrol.online.gate import endless
+from perfcontrol.online.learning import iterate
 from tests.online.plants import drawn, run_episode
 from tests.solvers.problems import drifting, performative_prediction
 from tests.tools import assert_refused, normal
@@ -149,6 +150,23 @@ def test_step_without_a_policy_is_taken_back_and_learning_goes_on():
     kept(state, "no policy came of the step", "divergence threshold")
     assert state.learner.result == pc.Result.running
     np.testing.assert_array_equal(state.deployed, first.deployed)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"average": pc.Average(0.0, "batch means"), "steps": 100}, {"schedule": pc.Lazy(2)}],
+    ids=["averaged", "lazy"],
+)
+def test_what_was_learnt_since_the_last_deployment_is_taken_back_where_it_is_refused(settings):
+    problem = drifting()
+    controller = pc.online.Controller(
+        problem, pc.RSGD(**({"steps": 10, "step_size": 0.02} | settings)), gate=pc.online.Gate(**OFF | {"cost": 1e-6})
+    )
+    state = learn(controller, controller.init(), problem, 4)
+    kept(state, "predicted cost")
+    assert int(state.learner.own.count) == int(state.learner.steps) == 4
+    np.testing.assert_array_equal(iterate(state.learner), 0)
+    np.testing.assert_array_equal(state.learner.M, 0)
 
 
 def test_gate_that_asks_for_what_the_model_does_not_know_is_refused_before_anything_is_deployed():
