@@ -1,5 +1,7 @@
 """The fit against plain NumPy regressions, likelihoods by finite differences, and worlds that are known."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -211,6 +213,16 @@ def test_fitted_problem_costs_what_a_problem_of_the_same_numbers_costs() -> None
     )
     M = small_policies()[3]
     assert_close(pc.expected_cost(problem, M), pc.expected_cost(by_hand, M), 1e-10)
+
+
+def test_a_constant_scale_that_came_out_negative_makes_the_same_problem() -> None:
+    fit = fitted()
+    block = fit.estimated.spread.block
+    flipped = block._replace(values=np.where(np.arange(len(block.values)) == 3, -block.values, block.values))
+    spread = fit.estimated.spread._replace(block=flipped)
+    other = replace(fit, estimated=fit.estimated._replace(spread=spread))
+    costs = [float(pc.expected_cost(f.problem(cost=COST, horizon=9), small_policies()[1])) for f in (fit, other)]
+    assert costs[0] == pytest.approx(costs[1], rel=1e-12)
 
 
 def test_ensemble_is_one_stacked_problem_that_spreads_as_the_standard_errors_say() -> None:

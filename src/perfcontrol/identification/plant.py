@@ -51,7 +51,9 @@ def build(
 def _perturbation(c: Coefficients, mean: Features, scale: Features, law: str) -> AbstractPerturbation:
     reaction = mean.as_map(c.mean) if c.mean.shape[-1] > 1 else None
     if len(c.directions):
-        return DirectionalPerturbation(c.directions, scale.as_map(c.scale), reaction, law)
+        # The fit leaves the sign of a constant scale open; the family takes none below zero.
+        sigma = scale.as_map(c.scale if c.scale.shape[-1] > 1 else jnp.abs(c.scale))
+        return DirectionalPerturbation(c.directions, sigma, reaction, law)
     if reaction is not None:
         return DirectionalPerturbation(jnp.zeros((1, *c.mean.shape[:2])), jnp.zeros(1), reaction, law)
     return NoPerturbation()

@@ -1,0 +1,76 @@
+"""What `pc.fit`, `pc.test_reaction` and `Fit.decide` are worth on known plants: errors, coverage, levels, decisions.
+
+    python -m benchmarks.identification [--only coverage] [--share 0.1] [--out table.md]
+
+`--share` scales all counts of data sets. The whole takes hours on one core; every part can be run alone.
+"""
+
+import argparse
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import jax
+
+jax.config.update("jax_enable_x64", True)
+
+from benchmarks import decisions, estimates, reaction_levels  # noqa: E402 - after JAX is configured
+from benchmarks.plants import plant  # noqa: E402
+
+
+def parts(share: float) -> dict[str, Callable[[], list[str]]]:
+    """The tables by name."""
+
+    def count(full: int) -> int:
+        return max(1, round(share * full))
+
+    def coverage() -> list[str]:
+        lines = ["| plant | block | parameters | covered | lowest | highest | outside 92-98 % |", "|" + " --- |" * 7]
+        for seed, n, kind, given in ((0, 2, "norm", True), (0, 2, "norm", False), (4, 3, "matrix and affine", True)):
+            lines += estimates.coverage(plant(seed, n, kind), count(500), 40, given)
+        return lines
+
+    def deciding() -> list[str]:
+        head = "| directions | reaction | systems | solved | median | 90 % | largest | ignoring the reaction, median |"
+        lines = [head, "|" + " --- |" * 8]
+        for directions in ("given", "estimated"):
+            lines += decisions.end_to_end(count(50), directions)
+        return lines
+
+    def ensembles() -> list[str]:
+        head = "| reaction | data sets | members | level | cost | cost of M | policy, entries | certified |"
+        lines = [head, "|" + " --- |" * 8]
+        for reaction in (None, "auto"):
+            lines += decisions.ensembles(count(50), 1, 200, 0.95, reaction)
+        return lines
+
+    return {
+        "recovery": lambda: estimates.recovery(count(25), (8, 80, 800)),
+        "coverage": coverage,
+        "levels": lambda: reaction_levels.levels(count(1000), 15),
+        "power": lambda: reaction_levels.power(count(200), (2, 3)),
+        "decisions": deciding,
+        "ensembles": ensembles,
+    }
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Print the tables, and write them where asked."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", choices=list(parts(1.0)), action="append")
+    parser.add_argument("--share", type=float, default=1.0)
+    parser.add_argument("--out", type=Path)
+    options = parser.parse_args(arguments)
+    tables = parts(options.share)
+    text = ""
+    for name in options.only or tables:
+        table = f"## {name}\n\n" + "\n".join(tables[name]()) + "\n\n"
+        sys.stdout.write(table)
+        sys.stdout.flush()
+        text += table
+    if options.out:
+        options.out.write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
