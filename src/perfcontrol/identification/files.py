@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 
 from perfcontrol._checks import fail
-from perfcontrol.identification.logs import Logs
+
+Contents = tuple[Any, Any, Any]  # x, u, deployed, as `Logs` takes them
 
 EPISODES, POLICIES = "episodes.csv", "policies.csv"
 
 
-def to_csv(logs: Logs, folder: Path) -> None:
+def to_csv(logs: Any, folder: Path) -> None:
     """See `Logs.to_csv`."""
     if folder.exists():
         raise fail("folder", f"{folder}, which exists", "be new", "Remove it or choose another name.")
@@ -29,7 +30,7 @@ def to_csv(logs: Logs, folder: Path) -> None:
         shutil.rmtree(temporary, ignore_errors=True)
 
 
-def _write(logs: Logs, folder: Path) -> None:
+def _write(logs: Any, folder: Path) -> None:
     states = [f"x{i}" for i in range(logs.state_size)]
     inputs = [f"u{i}" for i in range(logs.input_size)]
     width = len(str(len(logs) - 1))
@@ -58,8 +59,8 @@ def _write_rows(path: Path, header: list[str], rows: Any) -> None:
         writer.writerows(rows)
 
 
-def from_csv(folder: Path) -> Logs:
-    """See `Logs.from_csv`."""
+def from_csv(folder: Path) -> Contents:
+    """What `Logs.from_csv` makes logs of."""
     if not folder.is_dir():
         raise fail("folder", str(folder), "be a folder of logs", f"It holds {EPISODES}, {POLICIES} and the episodes.")
     names, index = _read(folder / EPISODES, ["file", "policy"], ["file"])
@@ -76,7 +77,7 @@ def from_csv(folder: Path) -> Logs:
     shapes = {policy.shape for policy in deployed}
     if len(shapes) > 1:
         raise fail(POLICIES, f"policies of shapes {sorted(shapes)}", "be all of one shape", "Fill lags with zeros.")
-    return Logs(x, u, np.stack(deployed)) if deployed else Logs([], [], [])
+    return (x, u, np.stack(deployed)) if deployed else ([], [], [])
 
 
 def _read(path: Path, required: list[str], text: list[str]) -> tuple[dict[str, list[str]], np.ndarray]:
@@ -136,7 +137,7 @@ def _read_episode(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return x, u[:-1] if len(u) and np.all(np.isnan(u[-1])) else u
 
 
-def to_dataset(logs: Logs) -> Any:
+def to_dataset(logs: Any) -> Any:
     """See `Logs.to_dataset`."""
     import xarray
 
@@ -160,8 +161,8 @@ def to_dataset(logs: Logs) -> Any:
     )
 
 
-def from_dataset(dataset: Any) -> Logs:
-    """See `Logs.from_dataset`."""
+def from_dataset(dataset: Any) -> Contents:
+    """What `Logs.from_dataset` makes logs of."""
     missing = [name for name in ("x", "u", "deployed") if name not in dataset]
     if missing:
         raise fail("dataset", f"no {', '.join(missing)}", "hold x, u and deployed", "See Logs.to_dataset.")
@@ -176,10 +177,10 @@ def from_dataset(dataset: Any) -> Logs:
             raise fail("dataset", got, f"hold {name} over {dims}", "Rename its dimensions.")
     x, u, deployed = (dataset[name].transpose(*dims).values for name, dims in axes.items())
     if "transitions" not in dataset:
-        return Logs(x, u, deployed)
+        return x, u, deployed
     lengths = dataset["transitions"].values.astype(int).tolist()
     inputs = [_trimmed(row[: length + 1], length) for row, length in zip(u, lengths, strict=True)]
-    return Logs([row[: length + 1] for row, length in zip(x, lengths, strict=True)], inputs, deployed)
+    return [row[: length + 1] for row, length in zip(x, lengths, strict=True)], inputs, deployed
 
 
 def _trimmed(inputs: np.ndarray, length: int) -> np.ndarray:

@@ -13,6 +13,7 @@ import numpy as np
 
 from perfcontrol._checks import check_integer, check_key, fail
 from perfcontrol.evaluate import simulate
+from perfcontrol.identification.files import from_csv, from_dataset, to_csv, to_dataset
 from perfcontrol.problem import PerformativeProblem
 
 
@@ -127,29 +128,21 @@ class Logs(eqx.Module):
 
     def to_dataset(self) -> Any:
         """An xarray Dataset: x (episode, time, state), u (episode, time, input), deployed; `transitions` an episode."""
-        from perfcontrol.identification.files import to_dataset
-
         return to_dataset(self)
 
     @classmethod
     def from_dataset(cls, dataset: Any) -> "Logs":
         """Logs from a Dataset as `to_dataset` makes it; values past the end of an episode are ignored."""
-        from perfcontrol.identification.files import from_dataset
-
-        return from_dataset(dataset)
+        return cls(*from_dataset(dataset))
 
     def to_csv(self, folder: str | Path) -> None:
         """Write a new folder with one file an episode, `episodes.csv` and `policies.csv`; all of it or nothing."""
-        from perfcontrol.identification.files import to_csv
-
         to_csv(self, Path(folder))
 
     @classmethod
     def from_csv(cls, folder: str | Path) -> "Logs":
         """Logs from a folder as `to_csv` writes it."""
-        from perfcontrol.identification.files import from_csv
-
-        return from_csv(Path(folder))
+        return cls(*from_csv(Path(folder)))
 
 
 def _numbers(name: str, value: Any) -> np.ndarray:

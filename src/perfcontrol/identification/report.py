@@ -1,13 +1,10 @@
 """A fit in words and as a labelled table."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from perfcontrol.evaluate import Estimate
-
-if TYPE_CHECKING:
-    from perfcontrol.identification.result import Fit
 
 NORMAL = 1.959963984540054  # 97.5 % point of the normal law
 VALUES = ("estimate", "standard_error", "low", "high")
@@ -19,7 +16,7 @@ def interval(estimate: Estimate) -> np.ndarray:
     return np.stack([mean, error, mean - NORMAL * error, mean + NORMAL * error])
 
 
-def table(fit: "Fit") -> Any:
+def table(fit: Any) -> Any:
     """See `Fit.table`."""
     import xarray
 
@@ -48,7 +45,7 @@ def table(fit: "Fit") -> Any:
     )
 
 
-def paragraph(fit: "Fit") -> str:
+def paragraph(fit: Any) -> str:
     """See `Fit.__str__`."""
     episodes, policies = len(fit.logs), len(fit.logs.policies)
     n, m = fit.logs.state_size, fit.logs.input_size

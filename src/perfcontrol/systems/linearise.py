@@ -120,6 +120,7 @@ def linearise(f: Callable, state: Any, input: Any, policy: Any = None, tolerance
     """Linearise a differentiable map at an equilibrium, by automatic differentiation.
 
     Examples:
+        >>> import jax.numpy as jnp
         >>> pendulum = lambda x, u: x + 0.1 * jnp.array([x[1], -jnp.sin(x[0]) + u[0]])
         >>> near = linearise(pendulum, [0.0, 0.0], [0.0])
         >>> near.A.tolist(), near.B.tolist()
