@@ -98,11 +98,12 @@ def test_sampled_optimum_is_as_far_from_the_exact_one_as_it_says(kind, feasible_
 def test_ball_of_confidence_holds_the_optimum_as_often_as_it_says(kind):
     exact = pc.solve(problem_of(kind), pc.PerformativeOptimum()).M
     solver, inside = pc.PerformativeOptimum(tolerance=0.05, sampling=pc.SampleAverage(1024)), 0
-    for seed in range(100):
-        found = pc.solve(problem_of(kind, True), solver, key=jax.random.key(seed))
+    problem = problem_of(kind, True)  # once: its function is a new one each time, and compiled anew
+    for seed in range(40):
+        found = pc.solve(problem, solver, key=jax.random.key(seed))
         inside += float(jnp.linalg.norm(found.M - exact)) <= float(found.stats["confidence_radius"])
-    print(f"{kind}: {inside} of 100")
-    assert inside >= 89  # 95 %, less than three standard errors
+    print(f"{kind}: {inside} of 40")
+    assert inside >= 34  # of 95 %, fewer in one case of two hundred
 
 
 def test_optimum_without_moments_asks_for_a_key():
