@@ -98,3 +98,18 @@ def steered() -> pc.PerformativeProblem:
             mean=pc.Affine(np.zeros((2, 2)), 0.3 * normal(0, 2, 2, 1, 1, 2)),
         ),
     )
+
+
+def overflowing() -> pc.PerformativeProblem:
+    """The world of any policy but a tiny one is not finite."""
+
+    def scale(M, params):
+        return jnp.where(jnp.sum(M**2) > params["limit"], jnp.inf, 0.1)[None]
+
+    return pc.PerformativeProblem(
+        system=pc.LinearSystem([[0.5]], [[1.0]]),
+        horizon=4,
+        noise=pc.Uniform([-1.0], [1.0]),
+        cost=pc.QuadraticCost([[1.0]], [[1.0]]),
+        perturbation=pc.DirectionalPerturbation([[[1.0]]], pc.Function(scale, {"limit": 1e-3})),
+    )

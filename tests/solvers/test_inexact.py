@@ -10,7 +10,7 @@ import pytest
 import perfcontrol as pc
 from perfcontrol.response.sampled import Sampled, approach
 from tests.contracts.solver import SolverContract
-from tests.solvers.problems import drifting, performative_prediction, steered, strongly_performative
+from tests.solvers.problems import drifting, overflowing, performative_prediction, steered, strongly_performative
 from tests.solvers.test_sampled_run import as_function, within
 from tests.tools import assert_close, assert_refused
 
@@ -127,16 +127,7 @@ def test_sampled_run_ends_at_the_exact_stable_policy_within_its_error():
 
 
 def test_world_that_overflows_ends_as_nonfinite():
-    def scale(M, params):
-        return jnp.where(jnp.sum(M**2) > params["limit"], jnp.inf, 0.1)[None]
-
-    problem = pc.PerformativeProblem(
-        system=pc.LinearSystem([[0.5]], [[1.0]]),
-        horizon=4,
-        noise=pc.Uniform([-1.0], [1.0]),
-        cost=pc.QuadraticCost([[1.0]], [[1.0]]),
-        perturbation=pc.DirectionalPerturbation([[[1.0]]], pc.Function(scale, {"limit": 1e-3})),
-    )
+    problem = overflowing()
     for solver in (pc.RRM(inner_steps=3), pc.RRM(inner_steps=3, anderson=2)):
         solution = pc.solve(problem, solver, throw=False)
         assert solution.result == pc.Result.nonfinite and bool(jnp.all(jnp.isfinite(solution.history)))

@@ -8,7 +8,7 @@ import pytest
 import perfcontrol as pc
 from tests.contracts.solver import SolverContract
 from tests.oracles.performative_prediction import stable_decision
-from tests.solvers.problems import MEAN, drifting, performative_prediction, strongly_performative
+from tests.solvers.problems import MEAN, drifting, overflowing, performative_prediction, strongly_performative
 from tests.tools import assert_close, assert_refused, tolerance
 
 
@@ -62,16 +62,7 @@ def test_rrm_ends_as_not_converged_when_it_cycles():
 
 
 def test_rrm_ends_as_nonfinite_with_the_last_finite_iterate_when_the_world_overflows():
-    def scale(M, params):
-        return jnp.where(jnp.sum(M**2) > params["limit"], jnp.inf, 0.1)[None]
-
-    problem = pc.PerformativeProblem(
-        system=pc.LinearSystem([[0.5]], [[1.0]]),
-        horizon=4,
-        noise=pc.Uniform([-1.0], [1.0]),
-        cost=pc.QuadraticCost([[1.0]], [[1.0]]),
-        perturbation=pc.DirectionalPerturbation([[[1.0]]], pc.Function(scale, {"limit": 1e-3})),
-    )
+    problem = overflowing()
     solution = pc.solve(problem, pc.RRM(), throw=False)
     assert solution.result == pc.Result.nonfinite and int(solution.steps) == 2
     np.testing.assert_array_equal(solution.M, solution.history[1])

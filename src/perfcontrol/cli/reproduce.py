@@ -5,10 +5,10 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from perfcontrol.cli.app import app, configure_jax, console, errors, in_words, refuse
+from perfcontrol.cli.app import app, configure_jax, console, in_words, refuse
+from perfcontrol.cli.progress import stages
 
 _COLOURS = {"holds": "green", "holds as completed": "cyan", "does not hold": "yellow"}
 
@@ -66,19 +66,8 @@ def reproduce(
     configure_jax()
     from perfcontrol.experiments.reproduce import reproduce as run
 
-    with Progress(
-        TextColumn("{task.description:<26}"), BarColumn(), TextColumn("{task.percentage:>3.0f}%"), TimeElapsedColumn(),
-        console=errors,
-    ) as bars:  # fmt: skip
-        tasks: dict[str, Any] = {}
-
-        def show(stage: str, share: float) -> None:
-            if stage not in tasks:
-                tasks[stage] = bars.add_task(stage, total=1.0)
-            bars.update(tasks[stage], completed=min(share, 1.0))
-
-        with in_words(f"write to {out}"):
-            outcome = run(out, settings, show, fresh)
+    with stages() as show, in_words(f"write to {out}"):
+        outcome = run(out, settings, show, fresh)
     table = Table("#", "claim", "statistic", "verdict", title="Claims of the paper's numerical section")
     for number, claim in enumerate(outcome.claims, 1):
         colour = _COLOURS[claim.verdict]

@@ -3,13 +3,13 @@
 import datetime
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from perfcontrol.cli.app import app, configure_jax, console, errors, in_words, refuse, shown
+from perfcontrol.cli.app import app, configure_jax, console, in_words, refuse, shown
+from perfcontrol.cli.progress import stages
 
 if TYPE_CHECKING:
     from perfcontrol.experiments.prices.study import Study
@@ -58,17 +58,7 @@ def stocks(
         chosen = None if names is None else [name.strip() for name in names.split(",")]
         used = (504 if window is None else window) + windows * horizon + 1
         table = read_prices(prices, chosen, _date("--from", start), _date("--to", end), used, splits)
-    with Progress(
-        TextColumn("{task.description:<26}"), BarColumn(), TextColumn("{task.percentage:>3.0f}%"), TimeElapsedColumn(),
-        console=errors, transient=True,
-    ) as bars:  # fmt: skip
-        tasks: dict[str, Any] = {}
-
-        def show(stage: str, share: float) -> None:
-            if stage not in tasks:
-                tasks[stage] = bars.add_task(stage, total=1.0)
-            bars.update(tasks[stage], completed=min(share, 1.0))
-
+    with stages(transient=True) as show:
         found = study(
             table,
             horizon=horizon,

@@ -16,7 +16,7 @@ from perfcontrol.problem import PerformativeProblem, check_problem
 from perfcontrol.response import best_response
 from perfcontrol.solvers import PerformativeOptimum, Result, Solution, StablePoint, solve
 from perfcontrol.solvers.solve import check_feasible
-from perfcontrol.theory.optimality import OptimalityBound, optimality_bound
+from perfcontrol.theory.optimality.bound import OptimalityBound, bound_from
 from perfcontrol.theory.precision import in_double
 from perfcontrol.theory.stability.stable_policy import find_stable_policy
 
@@ -170,8 +170,8 @@ def price_of_stability(
         check_feasible("deployed_before", problem, before)
     naive = best_response(problem, before)
     stable = _stable(problem, before)
-    bound = None if gap is None else optimality_bound(problem, gap)
     optimum = solve(problem, solver, before, throw=False)
+    bound = None if gap is None else bound_from(problem, optimum.M, gap)
     cost_stable, cost_naive = _cost(problem, stable.M), _cost(problem, naive)
     if cost_stable is None:
         raise _no_stable_policy("one whose world is not mean-square stable")

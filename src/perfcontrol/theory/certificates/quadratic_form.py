@@ -24,15 +24,15 @@ from perfcontrol.response.quadratic import Quadratic
 from perfcontrol.theory.facts import facts, nearest_to_zero
 
 
-class _GivenVariances(AbstractPerturbation):
-    """Fixed directions whose variances are given and differentiable, whatever the policy; never sampled."""
+class GivenMoments(AbstractPerturbation):
+    """A law of given mean and covariance, whatever the policy; never sampled."""
 
-    directions: Array
-    variances: Array
     mean_value: Matrix | None  # None for zero
+    spread: CovarianceOperator
+    width: int = eqx.field(static=True)  # columns of Δ
 
     def columns(self, state_size: int, input_size: int) -> int:
-        return self.directions.shape[-1]
+        return self.width
 
     def sample(self, key: Any, M: Array, horizon: int) -> Draws:
         raise NotImplementedError
@@ -44,7 +44,7 @@ class _GivenVariances(AbstractPerturbation):
         return self.mean_value
 
     def covariance(self, M: Array, horizon: int) -> CovarianceOperator:
-        return DirectionalCovariance(self.variances, self.directions)
+        return self.spread
 
     def bound(self, feasible_set: Any, horizon: int) -> None:
         return None
@@ -84,7 +84,7 @@ def _worlds(problem: PerformativeProblem, base: Any, variances: Any, along: Any)
     mean = law.mean_operator(lifted, problem.horizon)
 
     def at(variances: Array) -> CostToGo:
-        fixed = _GivenVariances(law.directions, variances, mean)
+        fixed = GivenMoments(mean, DirectionalCovariance(variances, law.directions), law.directions.shape[-1])
         return cost_to_go(eqx.tree_at(lambda p: p.perturbation, problem, fixed), lifted)
 
     world, derivative = jax.jvp(at, (variances,), (along,))

@@ -7,6 +7,7 @@ References: docs: theory, "The performative optimum", Theorem 10.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -71,7 +72,6 @@ class OptimalityBound:
         )
 
 
-@in_double
 def optimality_bound(problem: PerformativeProblem, gap: float = 1e-3, max_cells: int = 2000) -> OptimalityBound:
     """Bound the optimal cost min C_T(M; M) from below and above, by branch and bound to global optimality.
 
@@ -94,6 +94,12 @@ def optimality_bound(problem: PerformativeProblem, gap: float = 1e-3, max_cells:
     References:
         docs: theory, "The performative optimum", Theorem 10.
     """
+    return bound_from(problem, None, gap, max_cells)
+
+
+@in_double
+def bound_from(problem: PerformativeProblem, known: Any, gap: float, max_cells: int = 2000) -> OptimalityBound:
+    """`optimality_bound` with a good policy that is known already; None to look for one."""
     if not isinstance(gap, int | float | np.number) or not LEAST_GAP <= gap < np.inf:
         raise fail("gap", repr(gap), f"be a number, at least {LEAST_GAP:g}", "Pass gap=1e-3 for a tenth of a per cent.")
     max_cells = check_integer("max_cells", max_cells, 1)
@@ -104,7 +110,8 @@ def optimality_bound(problem: PerformativeProblem, gap: float = 1e-3, max_cells:
     shares = _shares(problem)
     if isinstance(shares, str):
         return OptimalityBound(False, (shares,))
-    best = np.asarray(solve(problem, PerformativeOptimum(), throw=False).M, dtype=float).reshape(-1)
+    known = solve(problem, PerformativeOptimum(), throw=False).M if known is None else known
+    best = np.asarray(known, dtype=float).reshape(-1)
     searches = [Search(share, best) for share in shares]
 
     def ends() -> tuple[float, float]:

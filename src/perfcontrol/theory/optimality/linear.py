@@ -1,14 +1,11 @@
 """Scales that are affine in the policy: they depend on as many linear functions of it as their slopes have rank."""
 
-from typing import Any
-
 import numpy as np
 
-from perfcontrol._programs import program
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.theory.derivatives import tangent_basis
 from perfcontrol.theory.facts import nearest_to_zero
-from perfcontrol.theory.optimality.relaxation import Least, Relaxation
+from perfcontrol.theory.optimality.relaxation import Least, Relaxation, support
 from perfcontrol.theory.optimality.scalars import AbstractScalars
 
 
@@ -26,7 +23,7 @@ class Linear(AbstractScalars):
         self.slopes = slopes @ self.rows.T
         self.low, self.high = (side * np.inf * np.ones(rank) for side in (-1, 1))
         directions = self.rows.reshape(rank, *problem.policy_shape)
-        reach = _support(problem.feasible_set, np.concatenate([directions, -directions])) if rank else None
+        reach = support(problem.feasible_set, np.concatenate([directions, -directions])) if rank else None
         if reach is not None:
             above, below = np.asarray(reach, dtype=float).reshape(2, rank)
             self.low, self.high = -below - self.rows @ self.base, above - self.rows @ self.base
@@ -49,8 +46,3 @@ class Linear(AbstractScalars):
 
     def least(self, relaxation: Relaxation, low: np.ndarray, high: np.ndarray, enough: float) -> Least:
         return relaxation.on_box(self.rows, low, high, enough) if len(low) else relaxation.least()
-
-
-@program
-def _support(feasible_set: Any, directions: Any) -> Any:
-    return feasible_set.support(directions)

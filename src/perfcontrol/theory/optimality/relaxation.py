@@ -143,7 +143,7 @@ class OnSet:
         self.start, moved = M, M - self.base
         slope_there = linear + hessian @ moved
         value = constant + float(linear @ moved + moved @ hessian @ moved / 2)
-        reach = _support(self.feasible_set, -slope_there.reshape(self.shape))
+        reach = support(self.feasible_set, -slope_there.reshape(self.shape))
         # q(M') ≥ q(M) + <∇q(M), M' - M>: on a set whose support is known, inexact minimisers still prove a bound.
         unproved = 0.0 if reach is None else max(float(reach) + float(slope_there @ M), 0.0)
         return Least(value - unproved, M)
@@ -189,8 +189,9 @@ class OnSet:
 
 
 @program
-def _support(feasible_set: AbstractSet, direction: Any) -> Any:
-    return feasible_set.support(direction)
+def support(feasible_set: AbstractSet, directions: Any) -> Any:
+    """sup <direction, M> over the set for each direction, or None."""
+    return feasible_set.support(directions)
 
 
 Relaxation = OnAffine | OnSet

@@ -13,17 +13,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from perfcontrol._linalg import Matrix, along_time, as_dense
+from perfcontrol._linalg import along_time, as_dense
 from perfcontrol._programs import program
 from perfcontrol.costs import QuadraticCost
 from perfcontrol.evaluate.cost_to_go import CostToGo, cost_to_go
 from perfcontrol.evaluate.exact import weigh
-from perfcontrol.perturbations import AbstractPerturbation, CovarianceOperator, Draws, StockPerturbation
+from perfcontrol.perturbations import StockPerturbation
 from perfcontrol.perturbations.stock import StockCovariance
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.random_vectors import AbstractRandomVector
 from perfcontrol.sets import RepeatedBlock, RowSimplex, RowSum
-from perfcontrol.theory.certificates.quadratic_form import Expansion, expand
+from perfcontrol.theory.certificates.quadratic_form import Expansion, GivenMoments, expand
 from perfcontrol.theory.facts import nearest_to_zero
 from perfcontrol.theory.optimality.distance import Distance
 from perfcontrol.theory.optimality.relaxation import OnAffine, OnSet, Relaxation
@@ -32,38 +32,13 @@ from perfcontrol.theory.optimality.search import Share
 ALIKE = 1e-12  # relative differences that count as rounding
 
 
-class _GivenSpread(AbstractPerturbation):
-    """A stock market whose diagonal variances are given, whatever the policy; never sampled."""
-
-    mean_value: Matrix
-    spread: Array  # (T, L, L)
-
-    def sample(self, key: Any, M: Array, horizon: int) -> Draws:
-        raise NotImplementedError
-
-    def mean(self, M: Array, horizon: int) -> Array:
-        raise NotImplementedError
-
-    def mean_operator(self, M: Array, horizon: int) -> Matrix:
-        return self.mean_value
-
-    def covariance(self, M: Array, horizon: int) -> CovarianceOperator:
-        return StockCovariance(self.spread)
-
-    def bound(self, feasible_set: Any, horizon: int) -> None:
-        return None
-
-    def sensitivity(self, feasible_set: Any, horizon: int) -> None:
-        return None
-
-
 @program
 def _world(problem: PerformativeProblem, base: Any, size: Any) -> CostToGo:
     """The world in which every row has ‖p‖² / exposure² = size."""
     law, lifted, T = problem.perturbation, problem.structure.lift(base), problem.horizon
     assert isinstance(law, StockPerturbation)
     spread = size * along_time(law.growth.covariance, 2, T)
-    given = _GivenSpread(law.mean_operator(lifted, T), spread)
+    given = GivenMoments(law.mean_operator(lifted, T), StockCovariance(spread), problem.state_size)
     return cost_to_go(eqx.tree_at(lambda p: p.perturbation, problem, given), lifted)
 
 
