@@ -10,6 +10,7 @@ import pytest
 from scipy import optimize
 
 import perfcontrol as pc
+from perfcontrol.theory.optimality.bound import _shares
 from tests.oracles.enumeration import enumerate_cost
 from tests.theory.optimality.problems import KINDS, SHAPE, reacting
 from tests.tools import assert_refused
@@ -61,6 +62,26 @@ def test_bound_contains_the_best_of_a_grid_and_a_local_search(kind, feasible):
     assert bound.gap == pytest.approx((bound.upper - bound.lower) / bound.upper) and bound.gap <= 1e-3
     assert float(pc.expected_cost(problem, bound.M)) == pytest.approx(bound.upper, rel=1e-12)
     assert problem.feasible_set.contains(jnp.asarray(bound.M))
+
+
+@pytest.mark.parametrize(("kind", "feasible"), [("affine", "ball"), ("two affine", "rows"), ("norm", "box")])
+def test_no_policy_of_a_cell_is_cheaper_than_the_bound_of_that_cell(kind, feasible):
+    """Cells wide enough for θ⁻ and θ⁺ to differ: a bound that is too high cannot hide behind the best policy known."""
+    problem = reacting(kind, feasible, 4)
+    (share,) = _shares(problem)
+    rng = np.random.default_rng(0)
+    policies = np.asarray(jax.vmap(problem.feasible_set.project)(jnp.asarray(rng.normal(size=(400, *SHAPE)))))
+    costs = np.asarray(_costs(problem, jnp.asarray(policies)))
+    scalars = np.array([share.scalars.at(M.reshape(-1)) for M in policies])
+    tight = 0
+    for pair in range(12):
+        low, high = np.sort(scalars[rng.integers(400, size=2)], axis=0)
+        inside = np.all((scalars >= low) & (scalars <= high), axis=1)
+        form = share.form(share.scalars.variances(low, high))
+        bound = share.scalars.least(share.relax(form), low, high, np.inf).value
+        assert bound <= costs[inside].min() * (1 + 1e-9), pair
+        tight += bound > 0.5 * costs[inside].min()
+    assert tight > 0  # and the bounds say something
 
 
 @pytest.mark.slow
