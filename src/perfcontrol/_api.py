@@ -4,6 +4,7 @@ import perfcontrol.environments as environments
 import perfcontrol.experiments as experiments
 import perfcontrol.interop as interop
 import perfcontrol.online as online
+import perfcontrol.plotting as plotting
 from perfcontrol._cache import cache
 from perfcontrol._calls import explain_calls
 from perfcontrol._checks import InputError
@@ -227,6 +228,7 @@ __all__ = [
     "online",
     "optimality_bound",
     "path_gradient",
+    "plotting",
     "price_of_stability",
     "recover_noise",
     "residual",

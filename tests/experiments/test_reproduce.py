@@ -20,7 +20,7 @@ from perfcontrol.experiments.reproduce.exact import exact_stage
 from perfcontrol.experiments.reproduce.laboratory import constant_step, laboratory
 from perfcontrol.experiments.reproduce.stages import Stages
 from perfcontrol.plotting import paper_figures
-from perfcontrol.report.paper import judge, regimes, theorems
+from perfcontrol.reports.paper import judge, regimes, theorems
 
 SETTINGS = ReproduceSettings(seeds=3, steps=100, cure_steps=200, sweep_seeds=2, sweep_steps=100)
 STAGES = ("exact", "exact_simplex", "optimum", "runs", "cure", "sweep")

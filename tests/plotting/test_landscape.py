@@ -133,3 +133,19 @@ def test_wrong_axes_and_problems_without_a_price_are_refused() -> None:
     assert_refused(lambda: pc.plotting.figure_landscape(quiet, axes=[plt.gca()]), "axes", "plt.subplots(1, 3)")
     assert_refused(lambda: pc.plotting.figure_landscape(None), "problem")
     plt.close("all")
+
+
+@pytest.mark.parametrize("view", ["plane", "worlds", "line"])
+def test_each_view_alone_is_that_of_the_figure(drawn: Drawn, view: str) -> None:
+    problem, price, _ = drawn
+    panel = pc.plotting.figure_landscape(problem, price)[("plane", "worlds", "line").index(view)]
+    axes = pc.plotting.plot_landscape(problem, price, view=view, ax=plt.subplots()[1])
+    assert axes.get_title() == panel.get_title() and _marks(axes) == _marks(panel)
+    assert axes.get_xlim() == panel.get_xlim() and axes.get_ylim() == panel.get_ylim()
+    plt.close("all")
+
+
+def test_plane_of_policies_on_one_line_is_refused() -> None:
+    problem = performative_optima.location(10.0, 0.4, 0.5)[0]
+    assert_refused(lambda: pc.plotting.plot_landscape(problem, view="plane"), "view", "'line'")
+    plt.close("all")

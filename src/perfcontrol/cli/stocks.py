@@ -90,7 +90,7 @@ def _date(option: str, text: str | None) -> datetime.date | None:
 def _write(found: "Study", out: Path) -> list[Path]:
     from perfcontrol import results
     from perfcontrol.plotting.market_figures import figure_allocations, figure_capital, figure_windows
-    from perfcontrol.report.market import markdown, weights_csv
+    from perfcontrol.reports.market import markdown, weights_csv
 
     with in_words(f"write to {out}"):
         results.save_json(found.data(), out / "stocks.json")

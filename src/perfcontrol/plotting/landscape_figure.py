@@ -11,12 +11,14 @@ from numpy.typing import ArrayLike
 
 from perfcontrol._checks import fail
 from perfcontrol.plotting.landscape import Landscape, landscape
-from perfcontrol.plotting.style import styled
+from perfcontrol.plotting.style import INK, LOOKS, SHADED, styled
+from perfcontrol.plotting.subjects import panels
 from perfcontrol.problem import PerformativeProblem, check_problem
 from perfcontrol.theory import PriceOfStability, price_of_stability
 from perfcontrol.theory.price import in_figures
 
-STABLE, OPTIMAL, NAIVE, OWN = "#C0392B", "#0072B2", "#E69F00", "#222222"
+STABLE, OPTIMAL, NAIVE = (LOOKS[name].colour for name in ("stable", "optimal", "naive"))
+OWN = SHADED
 MARKS: Any = {
     STABLE: {"marker": "o", "markersize": 5.5},
     OPTIMAL: {"marker": "*", "markersize": 10},
@@ -25,6 +27,7 @@ MARKS: Any = {
 PAPER = LinearSegmentedColormap.from_list("paper", ["#FFFFFF", "#DCE3EA", "#B3C0CD", "#8496A8", "#5C6F82"])
 BANDS = 5  # of colour between the optimal and the stable cost
 FOLD = 10  # from this ratio on costs are drawn on a logarithmic axis
+VIEWS = ("plane", "worlds", "line")
 PS, PO = r"M^{\mathrm{PS}}", r"M^{\mathrm{PO}}"
 
 
@@ -81,6 +84,45 @@ def figure_landscape(
         if axes is None:
             figure.legend(handles=_legend(found), loc="outside lower center", ncols=4 if found.has_plane else 3)
     return panels
+
+
+def plot_landscape(
+    problem: PerformativeProblem, price: PriceOfStability | None = None, *, view: str = "worlds", ax: Any = None
+) -> Axes:
+    """One of the three views of `figure_landscape`, on axes of its own.
+
+    Args:
+        problem: with a QuadraticCost and a perturbation of known moments.
+        price: of `pc.price_of_stability(problem)`; None computes it.
+        view: "plane" (policies about the three), "worlds" (each column a world) or "line" (costs as curves).
+        ax: Matplotlib axes; None makes a figure.
+
+    Returns:
+        The axes.
+
+    Raises:
+        InputError: as `figure_landscape`; an unknown view; the plane where the three policies lie on one line.
+    """
+    check_problem(problem)
+    if view not in VIEWS:
+        raise fail("view", repr(view), f"be one of {VIEWS}", "Pass one of these names.")
+    price = price_of_stability(problem) if price is None else price
+    with styled():
+        return draw_view(panels(ax, 1, (3.0, 2.9))[0], price, landscape(problem, price), view)
+
+
+def draw_view(axes: Axes, price: PriceOfStability, found: Landscape, view: str) -> Axes:
+    """One view of costs that are known."""
+    if view == "line":
+        _segment(axes, price, found)
+    elif view == "worlds":
+        _square(axes, price, found, _levels(price, found))
+    elif found.has_plane:
+        _plane(axes, price, found, _levels(price, found))
+    else:
+        got = "policies on one line"
+        raise fail("view", f"'plane' of {got}", "be 'worlds' or 'line' here", "There is no plane of the three.")
+    return axes
 
 
 def _levels(price: PriceOfStability, found: Landscape) -> np.ndarray:
@@ -204,7 +246,7 @@ def _segment(axes: Axes, price: PriceOfStability, found: Landscape) -> None:
         axes.set_ylim(low / price.ratio**0.15, price.cost_stable * price.ratio**0.6)
     axes.plot(s, at_stable, color=STABLE, label=f"$C(M; {PS})$")
     axes.plot(s, at_optimal, color=OPTIMAL, label=f"$C(M; {PO})$")
-    axes.plot(s, own, color=OWN, linewidth=2.2, label="$C(M; M)$")
+    axes.plot(s, own, color=INK, linewidth=2.2, label="$C(M; M)$")
     axes.plot([0, 1], [price.cost_stable] * 2, color="#555555", linewidth=0.8, linestyle=(0, (1, 2)))
     axes.annotate(
         "",
@@ -238,7 +280,7 @@ def _legend(found: Landscape) -> list[Line2D]:
         mark("stable", STABLE),
         mark("optimal", OPTIMAL),
         mark("naive", NAIVE),
-        line("in its own world", color=OWN, linewidth=2.2),
+        line("in its own world", color=INK, linewidth=2.2),
         line(f"in the world of ${PS}$", color=STABLE),
         line(f"in the world of ${PO}$", color=OPTIMAL),
         line("best response", color=OWN, linewidth=1, linestyle=(0, (4, 2))),

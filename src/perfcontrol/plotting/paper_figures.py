@@ -15,7 +15,7 @@ from matplotlib.ticker import NullFormatter
 
 from perfcontrol.config import ReproduceSettings
 from perfcontrol.plotting.style import ORDER_COLOURS, ORDER_MARKS, REGIME_TITLES, band, save_figure, styled
-from perfcontrol.report.paper.divergence import share_that_left
+from perfcontrol.reports.paper.divergence import share_that_left
 
 OPTIMUM: Any = {"linestyle": (0, (6, 2, 1, 2)), "linewidth": 0.9}
 CEILING = 1e4  # of the error axis, relative to the first error: beyond it a run has left for good

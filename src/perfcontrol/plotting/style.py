@@ -1,12 +1,14 @@
 """One look for all figures: colours that stay apart for colour-blind readers and in print."""
 
-from collections.abc import Iterator
+import itertools
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
+from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
@@ -20,7 +22,40 @@ REGIME_TITLES = {
     "general": "general",
 }
 
+INK, GRID = "#1A1A1A", "#DDDDDD"  # of text, frames and grids; reports replace them by the colours of their page
+SHADED = "#222222"  # lines on shades of grey, which stay light on every page
+
+
+class Look(NamedTuple):
+    """How one curve differs from the others: by colour, and without colours by line and mark."""
+
+    colour: str
+    line: Any
+    mark: str
+
+
+LOOKS = {
+    "stable": Look("#C0392B", "-", "o"),
+    "optimal": Look("#0072B2", (0, (6, 1.5)), "*"),
+    "naive": Look("#E69F00", (0, (3, 1.2, 1, 1.2)), "s"),
+}
+OTHER_LOOKS = (
+    Look("#009E73", (0, (1.2, 1.2)), "^"),
+    Look("#CC79A7", (0, (5, 1, 1, 1, 1, 1)), "D"),
+    Look("#56B4E9", (0, (8, 2)), "v"),
+    Look("#7F7F7F", (0, (2, 2)), "P"),
+)
+# Signed numbers: orange below zero, blue above, both dark at the ends also in grey.
+SIGNED = LinearSegmentedColormap.from_list(
+    "signed", ["#7F3B08", "#E08214", "#FBE3C4", "#F7F7F7", "#CFE3F2", "#4393C3", "#053061"]
+)
+
 _STYLE: Any = {
+    "text.color": INK,
+    "axes.edgecolor": INK,
+    "axes.labelcolor": INK,
+    "xtick.color": INK,
+    "ytick.color": INK,
     "font.family": ["STIXGeneral", "DejaVu Serif"],  # by name: figures saved outside `styled` keep it
     "mathtext.fontset": "stix",
     "font.size": 9,
@@ -32,7 +67,7 @@ _STYLE: Any = {
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.grid": True,
-    "grid.color": "#DDDDDD",
+    "grid.color": GRID,
     "grid.linewidth": 0.5,
     "lines.linewidth": 1.4,
     "legend.frameon": False,
@@ -54,6 +89,12 @@ def band(axes: Axes, x: ArrayLike, low: ArrayLike, middle: ArrayLike, high: Arra
     """A median with its band, in the colour of an order of the sensitivities."""
     axes.fill_between(x, low, high, color=ORDER_COLOURS[order], alpha=0.18, linewidth=0)
     axes.plot(x, middle, color=ORDER_COLOURS[order], label=order)
+
+
+def looks(names: Iterable[str]) -> dict[str, Look]:
+    """A look for each name: the three policies have theirs, whatever else is drawn; others take turns."""
+    spare = itertools.cycle(OTHER_LOOKS)
+    return {name: LOOKS.get(name) or next(spare) for name in names}
 
 
 def save_figure(figure: Figure, path: Path) -> list[Path]:

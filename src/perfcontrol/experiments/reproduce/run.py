@@ -22,8 +22,8 @@ from perfcontrol.experiments.reproduce.laboratory import laboratory, run_stage
 from perfcontrol.experiments.reproduce.optimum import optimum_stage
 from perfcontrol.experiments.reproduce.stages import Stages
 from perfcontrol.plotting import paper_figures
-from perfcontrol.report.claims import Claim, as_markdown
-from perfcontrol.report.paper import judge
+from perfcontrol.reports.claims import Claim, as_markdown
+from perfcontrol.reports.paper import judge
 
 STAGES = ("exact", "exact_simplex", "optimum", "runs", "cure", "sweep")
 

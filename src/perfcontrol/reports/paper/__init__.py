@@ -1,5 +1,5 @@
 """The statements of the paper's section "Numerical Experiments", and of its theorem and propositions."""
 
-from perfcontrol.report.paper.judge import judge
+from perfcontrol.reports.paper.judge import judge
 
 __all__ = ["judge"]

@@ -4,8 +4,8 @@ import numpy as np
 import xarray
 
 from perfcontrol.config import ReproduceSettings
-from perfcontrol.report.claims import Claim, bootstrap, loglog_slope, wilson
-from perfcontrol.report.paper.statistics import SECTION, listed, orders, relative_error, worst
+from perfcontrol.reports.claims import Claim, bootstrap, loglog_slope, wilson
+from perfcontrol.reports.paper.statistics import SECTION, listed, orders, relative_error, worst
 
 FAR_ORDERS = ("descending", "random")
 

@@ -3,8 +3,8 @@
 import xarray
 
 from perfcontrol.config import ReproduceSettings
-from perfcontrol.report.claims import Claim
-from perfcontrol.report.paper import divergence, regimes, theorems
+from perfcontrol.reports.claims import Claim
+from perfcontrol.reports.paper import divergence, regimes, theorems
 
 
 def judge(

@@ -3,8 +3,8 @@
 import numpy as np
 import xarray
 
-from perfcontrol.report.claims import Claim, bootstrap
-from perfcontrol.report.paper.statistics import listed, orders, worst
+from perfcontrol.reports.claims import Claim, bootstrap
+from perfcontrol.reports.paper.statistics import listed, orders, worst
 
 
 def share_that_left(sweep: xarray.Dataset) -> xarray.DataArray:

@@ -4,8 +4,8 @@ import numpy as np
 import xarray
 
 from perfcontrol.config import ReproduceSettings
-from perfcontrol.report.claims import Claim, Verdict, bootstrap, loglog_slope
-from perfcontrol.report.paper.statistics import SECTION, listed, orders, worst
+from perfcontrol.reports.claims import Claim, Verdict, bootstrap, loglog_slope
+from perfcontrol.reports.paper.statistics import SECTION, listed, orders, worst
 
 
 def existence(exact: xarray.Dataset, bounded: xarray.Dataset | None) -> Claim:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from perfcontrol.report.claims import Claim, as_markdown, bootstrap, loglog_slope, wilson
+from perfcontrol.reports.claims import Claim, as_markdown, bootstrap, loglog_slope, wilson
 
 
 @pytest.mark.parametrize(("successes", "trials"), [(0, 10), (3, 10), (32, 32)])

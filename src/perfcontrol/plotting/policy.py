@@ -1,0 +1,74 @@
+"""A policy as a heat map: which past disturbance moves which input, lag by lag."""
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from perfcontrol.plotting.style import SIGNED, styled
+from perfcontrol.plotting.subjects import input_names, panels, plain, state_names
+from perfcontrol.problem import PerformativeProblem, check_problem
+
+WRITTEN = 60  # entries up to which each is written into its cell
+NAMED = 24  # columns up to which each has its name
+
+
+def plot_policy(problem: PerformativeProblem, M: Any, *, ax: Any = None) -> Axes:
+    """The policy lag by lag: the entry in row j and column k of lag i is what w_{t-i}[k] adds to u_t[j].
+
+    Args:
+        problem: the problem.
+        M: free policy parameters, `problem.policy_shape`; the lifted policy is drawn.
+        ax: Matplotlib axes; None makes a figure.
+
+    Returns:
+        The axes.
+
+    Raises:
+        InputError: a policy of the wrong shape.
+    """
+    lifted = np.asarray(check_problem(problem).lift(M))
+    lags, rows, states = lifted.shape
+    columns = lags * states
+    stack = np.concatenate(list(lifted), axis=1)
+    largest = float(np.max(np.abs(stack), initial=0.0)) or 1.0
+    with styled():
+        size = min(max(2.2, 1.1 + 0.45 * columns), 7.4), min(max(1.3, 0.9 + 0.34 * rows), 5.6)
+        axes = panels(ax, 1, size)[0]
+        edges = np.arange(columns + 1), np.arange(rows + 1)
+        mesh = axes.pcolormesh(
+            *edges, stack, cmap=SIGNED, vmin=-largest, vmax=largest, edgecolors="white", linewidth=0.4
+        )
+        axes.invert_yaxis()
+        for lag in range(1, lags):
+            axes.axvline(lag * states, color="white", linewidth=4)
+        if stack.size <= WRITTEN:
+            for (j, k), value in np.ndenumerate(stack):
+                shade = "white" if abs(value) > 0.62 * largest else "black"
+                axes.text(k + 0.5, j + 0.5, f"{value:.2g}", ha="center", va="center", fontsize=7, color=shade)
+        _label(axes, problem, lags)
+        axes.figure.colorbar(mesh, ax=axes, shrink=0.9, pad=0.02, aspect=12)
+    return axes
+
+
+def _label(axes: Axes, problem: PerformativeProblem, lags: int) -> None:
+    rows, states = problem.input_size, problem.state_size
+    axes.grid(False)
+    axes.tick_params(length=0)
+    for spine in axes.spines.values():
+        spine.set_visible(False)
+    named = input_names(problem) if rows <= NAMED else [""] * rows
+    axes.set_yticks(np.arange(rows) + 0.5, [plain(name) for name in named])
+    axes.set_ylabel("input")
+    if lags * states <= NAMED:
+        names = [plain(name) for name in state_names(problem)]
+        turned = 0 if max(map(len, names)) <= 4 else 90
+        axes.set_xticks(np.arange(lags * states) + 0.5, names * lags, rotation=turned)
+        axes.set_xlabel("disturbance of")
+    else:
+        axes.set_xticks([])
+        axes.set_xlabel("disturbances of the states, in order")
+    top = axes.secondary_xaxis("top")
+    top.set_xticks(states * (np.arange(lags) + 0.5), [f"lag {lag + 1}" for lag in range(lags)])
+    top.tick_params(length=0)
+    top.spines["top"].set_visible(False)
