@@ -31,6 +31,11 @@ def written_whole(path: Path) -> Iterator[Path]:
             temporary.unlink(missing_ok=True)
 
 
+def leftovers(path: Path) -> list[Path]:
+    """Temporary files of writers of `path` that were killed; nobody may be writing it now."""
+    return list(path.parent.glob(f".{path.stem}.*{path.suffix}"))
+
+
 def _flush(path: Path, mode: int) -> None:
     handle = os.open(path, mode)
     try:

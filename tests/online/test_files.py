@@ -137,7 +137,7 @@ BROKEN = {
     "an array too many": (lambda a: a.update(more=np.zeros(2)), "more arrays"),
     "no header": (lambda a: a.pop("header.json"), "KeyError"),
     "another format": (header(lambda h: h.update(format="2")), "KeyError"),
-    "a header of lists": (header(lambda h: h.update(owner=[])), "KeyError"),
+    "a header of lists": (header(lambda h: h.update(owner=[])), "header"),
     "limits of another kind": (header(lambda h: h.update(limits={"speed": 1.0})), "header"),
     "a log of another kind": (header(lambda h: h.update(log=[[1]])), "header"),
 }

@@ -10,11 +10,7 @@ from jaxtyping import Array
 from perfcontrol._printing import Printed, Row, of_solution
 from perfcontrol._programs import Numbers, known, numerics
 from perfcontrol.problem import PerformativeProblem
-from perfcontrol.solvers.result import Result
-
-MEMBERS = (
-    Result.success, Result.running, Result.diverged, Result.nonfinite, Result.undersampled, Result.not_converged
-)  # fmt: skip
+from perfcontrol.solvers.result import MEMBERS, Result
 
 
 class SolveError(RuntimeError):
@@ -111,7 +107,7 @@ class Solution(Printed, eqx.Module):
     def _ended(self) -> str:
         if not self.steps.ndim:
             return Result[self.result]
-        counts = [(int(np.sum(np.asarray(self.result == member))), Result[member]) for member in MEMBERS]
+        counts = [(int(np.sum(np.asarray(self.result == member))), Result[member]) for member in MEMBERS.values()]
         return "; ".join(f"{count} of {self.steps.size}: {text}" for count, text in counts if count)
 
 

@@ -24,3 +24,14 @@ class Result(eqx.Enumeration):
         "The tolerance was not reached. The map may have no fixed point, or the method starts too far from one: try "
         "pc.StablePoint where repeated minimisation was used, another M0, pc.Continuation, or a larger tolerance."
     )
+
+
+MEMBERS = {
+    name: getattr(Result, name)
+    for name in ("success", "running", "diverged", "nonfinite", "undersampled", "not_converged")
+}
+
+
+def name_of(result: Result) -> str:
+    """The name of a known result."""
+    return next(name for name, member in MEMBERS.items() if bool(result == member))

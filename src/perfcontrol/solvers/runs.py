@@ -9,9 +9,11 @@ import numpy as np
 from jaxtyping import Array
 
 from perfcontrol._functions import call
-from perfcontrol._programs import numerics, on_host, program
+from perfcontrol._programs import on_host, program
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.solvers.base import AbstractSolver, State
+from perfcontrol.solvers.checkpoint import Forgotten
+from perfcontrol.solvers.history import joined
 from perfcontrol.solvers.result import Result
 
 CHUNK = 500  # iterations compiled together: long enough to cost nothing, short enough to stop early
@@ -40,6 +42,20 @@ class Run(NamedTuple):
     record: Record = identity
     every: int = 1
     progress: Callable[[int, int], None] | None = None
+
+
+def described(run: Run) -> tuple[dict[str, Any], Any]:
+    """What tells this run from others, by name, and the shapes of a record."""
+    parts = {
+        "problem": run.problem,
+        "solver": run.solver,
+        "start": run.M0,
+        "key": run.key,
+        "record": run.record,
+        "every": run.every,
+        "steps": run.total,
+    }
+    return parts, jax.eval_shape(lambda M: record_of(run.record, M), run.M0)
 
 
 def _run(
@@ -92,52 +108,53 @@ def traced(run: Run) -> tuple[State, Any]:
     history.append(kept)
     if total % every:
         state, _ = _run(solver, problem, state, key, whole, total % every, _nothing, 1)
-    return state, _joined(history)
+    return state, joined(history)
 
 
-def in_chunks(run: Run) -> tuple[State, Any]:
-    """The run in compiled chunks."""
+def in_chunks(run: Run, keeping: Forgotten) -> State:
+    """The run in compiled chunks, recorded in the history of `keeping`."""
     problem, solver, M0, key, total, record, every, progress = run
-    state = _compiled_init(solver, problem, M0)
-    history = [_recorded(record, M0)]
+    history = keeping.history
+    state, done = keeping.begin(_compiled_init(solver, problem, M0))
+    if not history.rows:
+        history.add(_recorded(record, M0))
     chunk = max(every, CHUNK - CHUNK % every)
-    done = 0
-    while done < total:
+    while done < total and state.result == Result.running:
         count = min(chunk, total - done)
         whole = count - count % every
         first = np.asarray(done)
         if whole:
-            state, kept = _compiled_run(solver, problem, state, key, first, whole, record, every)
-            history.append(kept)
+            state, rows = _compiled_run(solver, problem, state, key, first, whole, record, every)
+            history.add(rows)
         if count - whole:
             state, _ = _compiled_run(solver, problem, state, key, first + whole, count - whole, _nothing, 1)
         done += count
+        keeping.border(state, done, last=done == total or bool(state.result != Result.running))
         if progress is not None:
             progress(done, total)
-        if state.result != Result.running:
-            break
-    if done % every == 0:
-        history.append(_repeated(history[-1], (total - done) // every))
-    return state, _joined(history)
+    history.repeat(total // every + 1 - history.rows)
+    return state
 
 
-def from_host(run: Run) -> tuple[State, Any]:
+def from_host(run: Run, keeping: Forgotten) -> State:
     """The run step by step: the solver's own programs do the work."""
     problem, solver, M0, key, total, record, every, progress = run
-    state = solver.init(problem, on_host(M0))
-    history = [_recorded(record, M0)]
-    for done in range(1, total + 1):
-        state = solver.step(problem, state, None if key is None else jax.random.fold_in(key, done - 1))
-        if done % every == 0:
-            history.append(_recorded(record, state.M))
+    history = keeping.history
+    state, done = keeping.begin(solver.init(problem, on_host(M0)))
+    if not history.rows:
+        history.add(_recorded(record, M0))
+    while done < total and state.result is Result.running:  # known results are the members themselves
+        state = solver.step(problem, state, None if key is None else jax.random.fold_in(key, done))
+        done += 1
+        ended = state.result is not Result.running
+        # What is repeated is where the run ended, be it between two records.
+        if done % every == 0 or (ended and history.rows <= total // every):
+            history.add(_recorded(record, state.M))
+        keeping.border(state, done, last=done == total or ended)
         if progress is not None:
             progress(done, total)
-        if state.result is not Result.running:  # known results are the members themselves
-            if done % every and len(history) <= total // every:  # what is repeated is where the run ended
-                history.append(_recorded(record, state.M))
-            break
-    history.append(_repeated(history[-1], total // every + 1 - len(history)))
-    return state, _joined(history)
+    history.repeat(total // every + 1 - history.rows)
+    return state
 
 
 def _recorded(record: Record, M: Any) -> Any:
@@ -145,15 +162,5 @@ def _recorded(record: Record, M: Any) -> Any:
     return jax.tree.map(lambda leaf: leaf[None], value)
 
 
-def _repeated(recorded: Any, count: int) -> Any:
-    """What a run that ended early lacks to be as long as under jit."""
-    return jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf)[-1:], count, axis=0), recorded)
-
-
 def _nothing(M: Any) -> Array:
     return jnp.zeros(())
-
-
-def _joined(history: list[Any]) -> Any:
-    xp, _ = numerics(history)
-    return jax.tree.map(lambda *leaves: xp.concatenate(leaves), *history)

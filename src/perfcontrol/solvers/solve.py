@@ -13,8 +13,9 @@ from perfcontrol._checks import check_instance, check_integer, check_key, fail, 
 from perfcontrol._programs import on_host
 from perfcontrol.problem import PerformativeProblem, check_problem, warn_of_unstable_gain
 from perfcontrol.solvers.base import AbstractSolver, Solution, SolveError
+from perfcontrol.solvers.checkpoint import Forgotten, kept
 from perfcontrol.solvers.result import Result
-from perfcontrol.solvers.runs import Record, Run, from_host, identity, in_chunks, traced
+from perfcontrol.solvers.runs import Record, Run, described, from_host, identity, in_chunks, traced
 
 
 def solve(
@@ -28,6 +29,7 @@ def solve(
     every: int = 1,
     throw: bool = True,
     progress: Callable[[int, int], None] | None = None,
+    checkpoint: Any = None,
 ) -> Solution:
     """Run a solver on a problem.
 
@@ -44,6 +46,9 @@ def solve(
         every: record every so many steps.
         throw: raise SolveError unless the result is `success`.
         progress: called on the host with (steps done, steps at most) after each compiled chunk.
+        checkpoint: folder in which the run is kept: killed at any moment, the same call goes on from what was saved
+            last, to the same bits, and once it has ended returns at once. The history is streamed there and comes back
+            memory-mapped. A folder of another run, or one that another process works in, is refused.
 
     Raises:
         InputError: arguments that do not fit, before any work.
@@ -66,15 +71,20 @@ def solve(
     warn_of_unstable_gain(problem)
     run = Run(problem, solver, M0, key, total, identity if record is None else record, every, progress)
     stopped = max_steps is not None and max_steps < solver.max_steps
+    if not concrete and checkpoint is not None:
+        raise fail("checkpoint", str(checkpoint), "be left out under jit and vmap", "Call pc.solve itself.")
     if not concrete:
         state, history = traced(run)
         result, stats = solver.finish(problem, state, stopped)
         return Solution(state.M, result, state.steps, history, stats)
     with np.errstate(all="ignore"):  # numbers that are not finite become a named result
-        solution = _finished(run, stopped)
-        rescuer = None if stopped or solution.result == Result.success else solver.rescue(problem)
-        if rescuer is not None:
-            solution = _rescued(solution, _finished(Run(problem, rescuer, M0, key, rescuer.max_steps), False))
+        if checkpoint is None:
+            solution = _finished(run, stopped, Forgotten())
+        else:
+            with kept(checkpoint, *described(run)) as keeping:
+                solution = keeping.solution()
+                if solution is None:
+                    solution = _finished(run, stopped, keeping)
     if throw and solution.result != Result.success:
         raise SolveError(f"{Result[solution.result]} (step {int(solution.steps)})", solution)
     return solution
@@ -91,12 +101,23 @@ def check_feasible(name: str, problem: PerformativeProblem, M: Array) -> None:
         )
 
 
-def _finished(run: Run, stopped: bool) -> Solution:
-    """The solution of a run whose numbers are known."""
-    state, history = (from_host if run.solver.from_host else in_chunks)(run)
-    state = on_host(state)
+def _finished(run: Run, stopped: bool, keeping: Forgotten) -> Solution:
+    """The solution of a run whose numbers are known, by another method where this one fails and has one."""
+    solution = _ended(run, stopped, keeping)
+    rescuer = None if stopped or solution.result == Result.success else run.solver.rescue(run.problem)
+    if rescuer is not None:
+        other = Run(run.problem, rescuer, run.M0, run.key, rescuer.max_steps)
+        solution = _rescued(solution, _ended(other, False, keeping.below("rescue", *described(other))))
+    keeping.end(solution)
+    return solution
+
+
+def _ended(run: Run, stopped: bool, keeping: Forgotten) -> Solution:
+    """The solution of one method."""
+    state = on_host((from_host if run.solver.from_host else in_chunks)(run, keeping))
     result, stats = run.solver.finish(run.problem, state, stopped)
-    return Solution(*jax.tree.map(jnp.asarray, (state.M, result, state.steps, history, stats)))
+    M, result, steps, stats = jax.tree.map(jnp.asarray, (state.M, result, state.steps, stats))
+    return Solution(M, result, steps, keeping.history.all(), stats)
 
 
 def _rescued(failed: Solution, rescue: Solution) -> Solution:
