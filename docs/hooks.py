@@ -1,4 +1,5 @@
-"""What the pages need while they are built: one line a name in the reference, and equations drawn in advance.
+"""What the pages need while they are built: one line a name in the reference, equations drawn in advance, and a look
+at what would be fetched from elsewhere.
 
 A line `::: pc.NAME` in a page becomes the documentation of `perfcontrol.NAME` under the heading `pc.NAME`; words
 after the name are the members shown with it. `pymdownx.arithmatex` leaves an equation as escaped LaTeX inside an
@@ -89,3 +90,19 @@ def on_page_content(content: str, *, page, **_) -> str:
         return f'<{match["tag"]} class="equation-{kind}" data-search-exclude>{answer["html"]}</{match["tag"]}>'
 
     return EQUATION.sub(replace, content)
+
+
+FETCHED = re.compile(
+    r"""<(?:script|link|img|iframe|source|use)\b[^>]*?\s(?:src|href|srcset)=["']?(?P<tag>https?:|//)[^>]*"""
+    r"""|(?:@import|url\()\s*["']?(?P<style>https?:|//)[^)"';]*""",
+    re.IGNORECASE,
+)
+
+
+def on_post_build(config, **_) -> None:
+    """Warn of whatever a page or style sheet of the site would fetch from elsewhere."""
+    site = Path(config["site_dir"])
+    for file in sorted([*site.rglob("*.html"), *site.rglob("*.css")]):
+        for match in FETCHED.finditer(file.read_text(encoding="utf-8")):
+            if 'rel="canonical"' not in match[0]:
+                log.warning("%s fetches from elsewhere: %s", file.relative_to(site), match[0][:200])
