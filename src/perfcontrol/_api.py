@@ -44,6 +44,7 @@ from perfcontrol.perturbations import (
 from perfcontrol.policy import DisturbanceAction
 from perfcontrol.policy_maps import AbstractPolicyMap, Affine, Function, Norm
 from perfcontrol.problem import PerformativeProblem
+from perfcontrol.random_keys import fast_key
 from perfcontrol.random_vectors import (
     AbstractRandomVector,
     Constant,
@@ -222,6 +223,7 @@ __all__ = [
     "expected_cost_by_moments",
     "expected_gradient",
     "experiments",
+    "fast_key",
     "fit",
     "interop",
     "linearise",
