@@ -11,6 +11,7 @@ from perfcontrol.experiments.batches import CEILING, Ended, Runner, Runs, StepRu
 from perfcontrol.experiments.reproduce.cases import CASES, Progress, starts_of
 from perfcontrol.experiments.stock import HORIZON, ORDERS
 from perfcontrol.problem import PerformativeProblem
+from perfcontrol.random_keys import fast_key
 
 DIMINISHING_OFFSET = 10.0  # η_n = step 10 / (n + 10)
 
@@ -37,7 +38,7 @@ def laboratory(settings: ReproduceSettings, problems: list[PerformativeProblem],
     """The laboratory of one feasible set."""
     seeds = max(settings.seeds, settings.cure_seeds, settings.sweep_seeds)
     starts = starts_of(settings, problems[0], seeds).astype(np.float32)
-    return Laboratory(Runner(stack_problems(problems), jax.random.key(settings.seed)), exact, starts)
+    return Laboratory(Runner(stack_problems(problems), fast_key(settings.seed)), exact, starts)
 
 
 def constant_step(step: Any) -> StepRule:
