@@ -31,6 +31,7 @@ from perfcontrol.evaluate import (
     simulate,
     state_moments,
 )
+from perfcontrol.files import Run, load, save
 from perfcontrol.identification import Decision, Fit, Logs, ReactionTest, fit, test_reaction
 from perfcontrol.perturbations import (
     AbstractPerturbation,
@@ -192,6 +193,7 @@ __all__ = [
     "Rigorous",
     "RowSimplex",
     "RowSum",
+    "Run",
     "SampleAverage",
     "SampledPerturbation",
     "Sequence",
@@ -227,6 +229,7 @@ __all__ = [
     "fit",
     "interop",
     "linearise",
+    "load",
     "online",
     "optimality_bound",
     "path_gradient",
@@ -238,6 +241,7 @@ __all__ = [
     "rsgd_error_bound",
     "safe_step",
     "sample_gradient",
+    "save",
     "simulate",
     "solve",
     "state_moments",

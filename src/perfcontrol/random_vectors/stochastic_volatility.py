@@ -66,6 +66,7 @@ class StochasticVolatility(AbstractRandomVector):
         Appendix A, equation (Example 1-V(M)).
     """
 
+    sensitivities: Array
     log_sensitivity: Array
     rate: Array
     first_moment: Array
@@ -74,7 +75,7 @@ class StochasticVolatility(AbstractRandomVector):
     volatility: str = eqx.field(static=True)
 
     def __init__(self, sensitivities: Any, rate: Any, volatility: str = "lognormal", stocks: int | None = None):
-        sensitivities = as_array("sensitivities", sensitivities)
+        self.sensitivities = sensitivities = as_array("sensitivities", sensitivities)
         if sensitivities.ndim != 1 or (is_concrete(sensitivities) and np.any(np.asarray(sensitivities) <= 0)):
             raise fail("sensitivities", f"{sensitivities.shape}", "be positive numbers (T,)", "One per day.")
         if volatility not in VOLATILITIES:

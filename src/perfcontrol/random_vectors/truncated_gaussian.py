@@ -27,6 +27,7 @@ class TruncatedGaussian(AbstractRandomVector):
     """
 
     centre: Array
+    spread: Array  # Σ
     factor: Array  # Σ = factor factorᵀ
     shrinkage: Array  # truncated covariance = shrinkage Σ
     radius: Array
@@ -35,7 +36,8 @@ class TruncatedGaussian(AbstractRandomVector):
     rank: int = eqx.field(static=True)
 
     def __init__(self, mean: Any, covariance: Any, bound: Any):
-        self.centre, spread = mean_and_covariance(mean, covariance)
+        self.centre, self.spread = mean_and_covariance(mean, covariance)
+        spread = self.spread
         self.radius = as_array("bound", bound, "Without truncation it is pc.Gaussian(mean, covariance).")
         check_shape("bound", self.radius, (), (), "Pass one number, in standard deviations.")
         if not is_concrete(self.radius) or not is_concrete(spread):

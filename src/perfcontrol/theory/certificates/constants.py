@@ -88,6 +88,8 @@ def rigorous_constants(items: Ingredients, stability: StrongStability) -> Consta
         q * products(a) * (through_state[:, None] * state[None, :-1] + through_product[:, None] * beta[None, :-1])
     )
     lift = items.structure_norm
+    with np.errstate(over="ignore"):  # a bound that overflows is infinite: it proves nothing
+        variance = float(np.square(lift * gradient.sum()))
     return Constants(
         alpha,
         beta,
@@ -96,7 +98,7 @@ def rigorous_constants(items: Ingredients, stability: StrongStability) -> Consta
         lift**2 * items.smoothness * response**2,
         lift * gradient,
         lift * propagation,
-        float(lift * gradient.sum()) ** 2,
+        variance,
     )
 
 

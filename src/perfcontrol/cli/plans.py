@@ -1,0 +1,85 @@
+"""What the commands about a problem file share: reading it with changes, and carrying out what it asks for."""
+
+import contextlib
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from perfcontrol.files.building import Plan
+    from perfcontrol.files.run import Run
+
+RECORDED = 1000  # entries of a history, about
+
+File = Annotated[Path, typer.Argument(help="Problem file (TOML), or the folder of a run.")]
+Seed = Annotated[int | None, typer.Option(help="Of all randomness (that of the file).", min=0, max=2**32 - 1)]
+Settings = Annotated[
+    list[str] | None,
+    typer.Option("--set", help="key=value, in place of what the file says; may be given again.", metavar="KEY=VALUE"),
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Print the outcome as JSON, nothing else.")]
+
+
+def plan_in(path: Path, settings: list[str] | None = None, seed: int | None = None) -> "Plan":
+    """The plan of a problem file or run folder, with changes."""
+    from perfcontrol.files.building import plan_of
+    from perfcontrol.files.changing import changed
+    from perfcontrol.files.document import read_document
+    from perfcontrol.files.run import PROBLEM
+
+    document = read_document(path / PROBLEM if path.is_dir() else path)
+    plan = plan_of(changed(document, settings or []))
+    return plan if seed is None else replace(plan, seed=seed)
+
+
+def solved(plan: "Plan", progress: Callable[[int, int], None], kinds: tuple[str, ...] = ()) -> "Run":
+    """What a plan asks for, carried out; a failure is a result, too."""
+    import jax
+
+    from perfcontrol.files.run import Run
+    from perfcontrol.solvers import StablePoint, solve
+    from perfcontrol.theory import verdict_rows
+
+    solver = plan.solver or StablePoint()
+    every = max(1, -(-solver.max_steps // RECORDED))
+    key = jax.random.key(plan.seed)
+    began = time.perf_counter()
+    found = solve(plan.problem, solver, plan.M0, key=key, every=every, throw=False, progress=progress)
+    seconds = time.perf_counter() - began
+    rows = tuple(verdict_rows(plan.problem, kinds, key=key)) if kinds else ()
+    return Run(plan.problem, found, solver, plan.seed, plan.M0, every, rows, seconds=round(seconds, 3))
+
+
+@contextlib.contextmanager
+def kept(folder: Path, plan: "Plan", **settings: Any) -> Iterator[None]:
+    """A folder that is this process's own; begun with the plan unless it was begun before with the same one."""
+    from perfcontrol._checks import fail
+    from perfcontrol.files.locks import LOCK, locked
+    from perfcontrol.files.run import RECORD, begin
+
+    folder.mkdir(parents=True, exist_ok=True)
+    with locked(folder):
+        others = [entry.name for entry in folder.iterdir() if entry.name not in (LOCK, RECORD)]
+        if others or (folder / RECORD).exists():
+            remedy = f"Choose another folder, or go on there with `perfcontrol resume {folder}`."
+            raise fail("out", f"{folder}, which holds {others[0] if others else RECORD}", "be a new folder", remedy)
+        begin(folder, plan, **settings)
+        yield
+
+
+def cost_of(problem: Any, M: Any, seed: int, samples: int = 4096) -> dict[str, float | None]:
+    """C(M; M): exact where moments are known, else estimated with its standard error."""
+    import jax
+
+    from perfcontrol._checks import InputError
+    from perfcontrol.evaluate import estimate_cost, expected_cost
+
+    try:
+        return {"cost": float(expected_cost(problem, M)), "standard_error": None}
+    except InputError:
+        estimate = estimate_cost(problem, M, key=jax.random.fold_in(jax.random.key(seed), 1), samples=samples)
+        return {"cost": float(estimate.mean), "standard_error": float(estimate.standard_error)}
