@@ -41,6 +41,7 @@ def observed(steps, jump=0.0):
 
 
 problem = build()
+solution = pc.Solution(M, pc.Result.success, np.asarray(0), None, {})
 plant = controlled()
 begun = plant.init()
 DATA = np.zeros((2, 4, 2)), np.zeros((2, 4, 2)), np.zeros((2, 1, 2, 2))  # states, inputs, deployed policies
@@ -318,6 +319,14 @@ WRONG = {
         "unknown order": (lambda: pc.experiments.stock_market("up"), "order", "'up'"),
         "unknown set": (lambda: pc.experiments.stock_market(feasible_set="box"), "feasible_set", "'box'"),
         "order of sensitivities": (lambda: pc.experiments.stock_sensitivities(3), "order", "got 3"),
+    },
+    "files": {
+        "nothing that is kept": (lambda: pc.save(eye, "a.npz"), "thing", "a problem, a solution, or a run"),
+        "problem under another ending": (lambda: pc.save(problem, "a.npz"), "path", "a.toml"),
+        "file that is not there": (lambda: pc.load("nowhere.toml"), "path", "does not exist"),
+        "path as a number": (lambda: pc.load(3), "path", "int"),
+        "run without a solution": (lambda: pc.Run(problem, None), "solution", "None"),
+        "run of another problem": (lambda: pc.Run(build(memory=2), solution), "solution", "(2, 2, 2)"),
     },
 }
 ROWS = {f"{room}: {case}": row for room, cases in WRONG.items() for case, row in cases.items()}

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from perfcontrol._checks import InputError, fail
+from perfcontrol._checks import InputError, check_instance, check_integer, fail
 from perfcontrol._files import written_whole
 from perfcontrol._fingerprint import fingerprint
 from perfcontrol._printing import Printed, Row, public_name
@@ -17,7 +17,7 @@ from perfcontrol.files.document import read_text
 from perfcontrol.files.labels import dataset_of
 from perfcontrol.files.solutions import read_solution, write_solution
 from perfcontrol.files.writing import write_plan
-from perfcontrol.problem import PerformativeProblem
+from perfcontrol.problem import PerformativeProblem, check_problem
 from perfcontrol.solvers import AbstractSolver, Result, Solution
 
 FORMAT = "perfcontrol run 1"
@@ -37,8 +37,11 @@ class Run(Printed):
         M0: where it started; None for the solver's own start.
         every: steps between two entries of the solution's history.
         certificates: verdicts as plain data, one dict a kind, as `perfcontrol certify --out` writes them.
-        versions: of the packages that the numbers depend on; None for those in use now.
+        versions: of the packages that the numbers depend on; those in use unless told otherwise.
         seconds: that the solver took; None where that is not known.
+
+    Raises:
+        InputError: no problem, no solution, or one of another problem.
     """
 
     problem: PerformativeProblem
@@ -50,6 +53,17 @@ class Run(Printed):
     certificates: tuple[dict[str, Any], ...] = ()
     versions: dict[str, str] = field(default_factory=lambda: _versions())
     seconds: float | None = None
+
+    def __post_init__(self) -> None:
+        check_problem(self.problem)
+        check_instance("solution", self.solution, Solution, "pc.solve(problem, pc.StablePoint())")
+        if self.solver is not None:
+            check_instance("solver", self.solver, AbstractSolver, "pc.StablePoint()")
+        if self.solution.M.shape != self.problem.policy_shape:
+            got = f"a policy of shape {self.solution.M.shape}"
+            raise fail("solution", got, f"hold one of shape {self.problem.policy_shape}", "Save batches one by one.")
+        check_integer("seed", self.seed, 0)
+        check_integer("every", self.every, 1)
 
     @property
     def dataset(self) -> Any:
