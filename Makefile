@@ -58,7 +58,7 @@ reproduce: $(APP_READY) ## Run the paper's experiment into results/paper (option
 test: lint types imports docs doctest pytest pytest32 ## Run every check except the slow tests
 
 .PHONY: check
-check: test slow ## Run every check, the slow tests included
+check: test slow dist-check ## Run every check, the slow tests and the built package included
 
 .PHONY: lint
 lint: $(DEV_READY) ## Check style and formatting
@@ -106,6 +106,15 @@ slow: $(DEV_READY) ## Run the tests marked slow
 .PHONY: docs
 docs: $(DEV_READY) ## Build the documentation into site/, warnings being errors
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
+.PHONY: dist
+dist: $(DEV_READY) ## Build wheel and source distribution into dist/
+	rm -rf dist
+	$(BIN)/python -m build --outdir dist
+
+.PHONY: dist-check
+dist-check: dist ## Try the wheel in a fresh environment, away from the checkout
+	.ci/dist-check "$(PYTHON)"
 
 .PHONY: bench
 bench: $(DEV_READY) ## Run the benchmarks (options: ARGS="...")
