@@ -22,11 +22,18 @@ def load(name):
     return module
 
 
-notebook, hooks = load("notebook"), load("hooks")
+notebook, hooks, cases = load("notebook"), load("hooks"), load("cases")
 TUTORIAL = (DOCS / "tutorial.md").read_text("utf-8")
 WORLDS = json.loads(
     (DOCS / "assets" / "worlds-data.js").read_text("utf-8").removeprefix("const WORLDS = ").rstrip(";\n")
 )
+
+
+def assert_same_print(printed, said):
+    """Equal words, and numbers up to what platforms differ in."""
+    assert NUMBER.sub("#", printed) == NUMBER.sub("#", said)
+    for found, expected in zip(NUMBER.findall(printed), NUMBER.findall(said), strict=True):
+        assert float(found) == pytest.approx(float(expected), rel=2e-2), printed
 
 
 def test_tutorial_prints_what_the_page_says():
@@ -37,10 +44,7 @@ def test_tutorial_prints_what_the_page_says():
         printed = io.StringIO()
         with redirect_stdout(printed):
             exec(compile(code, "tutorial.md", "exec"), names)
-        printed = printed.getvalue()
-        assert NUMBER.sub("#", printed) == NUMBER.sub("#", said)
-        for found, expected in zip(NUMBER.findall(printed), NUMBER.findall(said), strict=True):
-            assert float(found) == pytest.approx(float(expected), rel=2e-2), printed
+        assert_same_print(printed.getvalue(), said)
 
 
 def test_numbers_in_the_words_of_the_tutorial_follow_from_what_it_prints():
@@ -61,6 +65,14 @@ def test_notebook_has_the_code_and_the_output_of_the_page():
     words = "".join(cell["source"] for cell in made["cells"] if cell["cell_type"] == "markdown")
     assert "\\[" not in words and "](certificates.md)" not in words and "```python" not in words
     assert len({cell["id"] for cell in made["cells"]}) == len(made["cells"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", cases.CASES)
+def test_case_study_prints_what_its_page_says(case):
+    page = (DOCS / "cases" / f"{case}.md").read_text("utf-8")
+    assert f"python examples/{cases.CASES[case]}.py" in page and f"img/case-{case}.png" in page
+    assert_same_print(cases.run(case)[1], cases.PRINTED.search(page)[0])
 
 
 def cost_by_recursion(share, slope, M, deployed, horizon=30):
