@@ -45,6 +45,13 @@ class TestUnboundedLawOfFixedScale(PerturbationContract):
         return pc.DensePerturbation(0.4, law=pc.Gaussian(np.zeros(9), 0.3 * random_psd(9, 9)))
 
 
+class TestGaussianEntries(PerturbationContract):
+    knows = ("mean", "covariance", "sensitivity")
+
+    def perturbation(self):
+        return pc.DensePerturbation(COMMON, MEAN, law="gaussian")
+
+
 class TestFunctionOfThePolicy(PerturbationContract):
     knows = ("mean", "covariance")
 

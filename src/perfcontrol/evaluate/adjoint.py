@@ -65,14 +65,17 @@ def path_gradient(problem: PerformativeProblem, path: Path | Trajectories) -> Ar
     varying = loop.ndim == 3
 
     def retreat(y: Array, step: Any) -> tuple[Array, tuple[Array, Array | None]]:
-        source_t, draw, loop_t, gain_t = step
-        reaction = path.draws.rmatvec_step(draw, y)
+        source_t, draw, loop_t, gain_t, z = step
+        reaction = path.draws.rmatvec_along(draw, y, z)
         pulled = rmatvec(loop_t if varying else loop, y) + source_t
         if acts_on_input:
             return pulled + reaction[:n] - rmatvec(gain_t, reaction[n:]), (y, reaction[n:])
         return pulled + reaction, (y, None)
 
-    steps = (source[:-1], path.draws.steps, loop if varying else None, gains[:-1] if acts_on_input else None)
+    met = None
+    if path.draws.remembers:
+        met = jnp.concatenate([path.x, path.u], axis=1)[:-1] if acts_on_input else path.x[:-1]
+    steps = (source[:-1], path.draws.steps, loop if varying else None, gains[:-1] if acts_on_input else None, met)
     _, (following, on_input) = jax.lax.scan(retreat, source[-1], steps, reverse=True)
     by_v = input_adjoint(system.B, following)
     if on_input is not None:
@@ -109,14 +112,16 @@ def recover_noise(
     return x[1:] - jnp.einsum("tij,tj->ti", A, x[:-1]) - input_term(problem.system.B, u)
 
 
-def over_paths(problem: PerformativeProblem, one: Callable[[Array], Any], key: Key[Array, ""], samples: int) -> Any:
+def over_paths(
+    problem: PerformativeProblem, one: Callable[[Array], Any], key: Key[Array, ""], samples: int, along: bool = False
+) -> Any:
     """What `one` makes of each of `samples` keys, with a leading axis; pure, for use inside compiled loops."""
     if samples == 1:
         return jax.tree.map(lambda leaf: leaf[None], one(key))
     return jax.lax.map(
         lambda index: one(jax.random.fold_in(key, index)),
         jnp.arange(samples),
-        batch_size=min(lanes(problem), samples),
+        batch_size=min(lanes(problem, along), samples),
     )
 
 
@@ -127,9 +132,9 @@ def mean_path_gradient(
     policy, reacting = problem.structure.lift(M), problem.structure.lift(deployed)
 
     def one(path_key: Array) -> Array:
-        return path_gradient(problem, sample_path(problem, policy, reacting, path_key))
+        return path_gradient(problem, sample_path(problem, policy, reacting, path_key, along=True))
 
-    return jnp.mean(over_paths(problem, one, key, samples), axis=0)
+    return jnp.mean(over_paths(problem, one, key, samples, along=True), axis=0)
 
 
 _compiled_mean_path_gradient = program(mean_path_gradient, on_device=True)

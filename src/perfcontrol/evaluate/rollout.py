@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Key
 from perfcontrol._checks import check_integer, check_key, fail
 from perfcontrol._linalg import Diagonal, Matrix, along_time, matvec
 from perfcontrol._programs import program
-from perfcontrol.perturbations import Draws
+from perfcontrol.perturbations import Draws, PathDraws
 from perfcontrol.policy import feedforward
 from perfcontrol.problem import PerformativeProblem, check_problem
 
@@ -28,7 +28,7 @@ class Path(eqx.Module):
     x: Float[Array, "T1 n"]
     u: Float[Array, "T1 m"]
     w: Float[Array, "T n"]
-    draws: Draws
+    draws: PathDraws
 
 
 class Trajectories(eqx.Module):
@@ -75,20 +75,25 @@ def input_adjoint(B: Matrix, y: Float[Array, "T n"]) -> Float[Array, "T m"]:
     return y @ B if B.ndim == 2 else jnp.einsum("tnm,tn->tm", B, y)
 
 
-def draw_path(problem: PerformativeProblem, deployed: Array, key: Key[Array, ""]) -> tuple[Array, Array, Draws]:
-    """Initial state (n,), noise (T, n) and perturbations of one path; `deployed` is lifted."""
+def draw_path(
+    problem: PerformativeProblem, deployed: Array, key: Key[Array, ""], along: bool = False
+) -> tuple[Array, Array, PathDraws]:
+    """Initial state (n,), noise (T, n) and perturbations of one path, or good for it alone; `deployed` is lifted."""
     initial_key, noise_key, perturbation_key = jax.random.split(key, 3)
     x0 = problem.initial_state.sample(initial_key, 1)[0].astype(deployed.dtype)
     w = problem.noise_under(deployed).sample(noise_key, problem.horizon).astype(deployed.dtype)
-    return x0, w, problem.perturbation.sample(perturbation_key, deployed, problem.horizon)
+    sample = problem.perturbation.sample_along if along else problem.perturbation.sample
+    return x0, w, sample(perturbation_key, deployed, problem.horizon)
 
 
-def sample_path(problem: PerformativeProblem, policy: Array, deployed: Array, key: Key[Array, ""]) -> Path:
-    """One path; `policy` and `deployed` are lifted."""
-    return run_path(problem, policy, *draw_path(problem, deployed, key))
+def sample_path(
+    problem: PerformativeProblem, policy: Array, deployed: Array, key: Key[Array, ""], along: bool = False
+) -> Path:
+    """One path; `policy` and `deployed` are lifted. Its draws serve for itself and its gradient alone if `along`."""
+    return run_path(problem, policy, *draw_path(problem, deployed, key, along))
 
 
-def run_path(problem: PerformativeProblem, policy: Array, x0: Array, w: Array, draws: Draws) -> Path:
+def run_path(problem: PerformativeProblem, policy: Array, x0: Array, w: Array, draws: PathDraws) -> Path:
     """The path of given noise and perturbations; `policy` is lifted."""
     system, gain = problem.system, problem.gain
     n, m = problem.state_size, problem.input_size
@@ -113,12 +118,15 @@ def run_path(problem: PerformativeProblem, policy: Array, x0: Array, w: Array, d
     return Path(x, v - problem.feedback(x) if problem.has_gain else v, w, draws)
 
 
-def lanes(problem: PerformativeProblem) -> int:
+def lanes(problem: PerformativeProblem, along: bool = False) -> int:
     """How many paths a batched loop works on together: `LANES`, fewer where their perturbations leave the cache."""
     policy = jax.ShapeDtypeStruct(problem.lifted_shape, problem.dtype)
     key = jax.eval_shape(lambda: jax.random.key(0))
     draws = eqx.filter_eval_shape(
-        lambda p, key, M: p.sample(key, M, problem.horizon).steps, problem.perturbation, key, policy
+        lambda p, key, M: (p.sample_along if along else p.sample)(key, M, problem.horizon).steps,
+        problem.perturbation,
+        key,
+        policy,
     )
     size = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(draws))
     return max(1, min(LANES, CACHE // max(size, 1)))
@@ -140,10 +148,10 @@ def _path_costs(problem: PerformativeProblem, M: Array, deployed: Array, key: Ar
     policy, reacting = problem.structure.lift(M), problem.structure.lift(deployed)
 
     def one(index: Array) -> Array:
-        path = sample_path(problem, policy, reacting, jax.random.fold_in(key, index))
+        path = sample_path(problem, policy, reacting, jax.random.fold_in(key, index), along=True)
         return jnp.sum(problem.cost.path_cost(path.x, path.u))
 
-    return jax.lax.map(one, jnp.arange(samples), batch_size=min(lanes(problem), samples))
+    return jax.lax.map(one, jnp.arange(samples), batch_size=min(lanes(problem, along=True), samples))
 
 
 def check_pair(problem: PerformativeProblem, M: Any, deployed: Any) -> tuple[Array, Array]:

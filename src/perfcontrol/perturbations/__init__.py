@@ -1,6 +1,6 @@
 """Perturbation laws D_t(M): the interface and one file a family."""
 
-from perfcontrol.perturbations.base import AbstractPerturbation, CovarianceOperator, DenseDraws, Draws
+from perfcontrol.perturbations.base import AbstractPerturbation, CovarianceOperator, DenseDraws, Draws, PathDraws
 from perfcontrol.perturbations.dense import DensePerturbation
 from perfcontrol.perturbations.directional import DirectionalPerturbation
 from perfcontrol.perturbations.finite import FinitePerturbation
@@ -18,6 +18,7 @@ __all__ = [
     "Draws",
     "FinitePerturbation",
     "NoPerturbation",
+    "PathDraws",
     "SampledPerturbation",
     "StockPerturbation",
 ]

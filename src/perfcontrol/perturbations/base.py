@@ -6,7 +6,7 @@ time loop carries only the former: loops call `*_step(step, ...)`, bulk code the
 
 import abc
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -16,8 +16,10 @@ from jaxtyping import Array, Float, Key
 from perfcontrol._linalg import Matrix, matvec, rmatvec, transpose
 
 
-class Draws(eqx.Module):
-    """One draw of Δ_0, ..., Δ_{T-1} as linear operators from R^p to R^n, p = n, or n+m for performative B."""
+class PathDraws(eqx.Module):
+    """One draw of Δ_0, ..., Δ_{T-1} for one path: each is applied once ahead, then at most once, transposed, back."""
+
+    remembers: ClassVar[bool] = False  # whether `rmatvec_along` looks at z
 
     @property
     @abc.abstractmethod
@@ -27,6 +29,17 @@ class Draws(eqx.Module):
     @abc.abstractmethod
     def matvec_step(self, step: Any, z: Float[Array, " p"]) -> Float[Array, " n"]:
         """Δ_t z."""
+
+    @abc.abstractmethod
+    def rmatvec_along(self, step: Any, y: Float[Array, " n"], z: Float[Array, " p"] | None) -> Float[Array, " p"]:
+        """Δ_tᵀ y of the Δ_t that was applied to z ahead; None where it does not remember."""
+
+
+class Draws(PathDraws):
+    """One draw of Δ_0, ..., Δ_{T-1} as linear operators from R^p to R^n, p = n, or n+m for performative B."""
+
+    def rmatvec_along(self, step: Any, y: Array, z: Array | None) -> Array:
+        return self.rmatvec_step(step, y)
 
     @abc.abstractmethod
     def rmatvec_step(self, step: Any, y: Float[Array, " n"]) -> Float[Array, " p"]:
@@ -104,6 +117,10 @@ class AbstractPerturbation(eqx.Module):
     @abc.abstractmethod
     def sample(self, key: Key[Array, ""], M: Array, horizon: int) -> Draws:
         """One draw of Δ_0..Δ_{T-1} under the deployed policy M."""
+
+    def sample_along(self, key: Key[Array, ""], M: Array, horizon: int) -> PathDraws:
+        """A draw that serves one path and its gradient, where that is cheaper than whole matrices; of the same law."""
+        return self.sample(key, M, horizon)
 
     @abc.abstractmethod
     def mean(self, M: Array, horizon: int) -> Float[Array, "T n p"] | None:

@@ -9,13 +9,22 @@ import jax.numpy as jnp
 from jaxtyping import Array, Key
 
 from perfcontrol._checks import as_array, check_instance, fail
-from perfcontrol.perturbations.base import AbstractPerturbation, CovarianceOperator, DenseDraws, Draws, zero_mean
+from perfcontrol.perturbations.base import (
+    AbstractPerturbation,
+    CovarianceOperator,
+    DenseDraws,
+    Draws,
+    PathDraws,
+    zero_mean,
+)
 from perfcontrol.perturbations.dependence import as_scale, check_values
 from perfcontrol.perturbations.scalar_laws import SCALAR_LAWS
+from perfcontrol.perturbations.white_draws import normal_draws, sphere_draws
 from perfcontrol.policy_maps import AbstractPolicyMap, as_policy_map, evaluate_map
 from perfcontrol.random_vectors import AbstractRandomVector
 
-WHITE_LAWS = (*sorted(SCALAR_LAWS), "sphere")
+WHITE_LAWS = (*sorted(SCALAR_LAWS), "gaussian", "sphere")
+BY_PRODUCTS = {"gaussian": normal_draws, "sphere": sphere_draws}  # what a path needs of them is cheap to draw
 
 
 class _WhiteCovariance(CovarianceOperator):
@@ -61,9 +70,11 @@ class DensePerturbation(AbstractPerturbation):
         scale: policy map, callable or array with values (), (T,), (n, p) or (T, n, p). For a named law, which is
             symmetric, only its square matters: a map may change sign, a constant below zero is refused.
         mean: policy map, callable or array with values (n, p) or (T, n, p); None is zero.
-        law: of Z: "rademacher", "uniform" or "truncated_gaussian" (independent entries of zero mean and unit variance),
-            "sphere" (uniform on the Frobenius sphere of radius √(n p), also of unit variances), or any random vector
-            of dimension n p, which fills Z row by row; then its mean and covariance count too.
+        law: of Z: "rademacher", "uniform", "truncated_gaussian" or "gaussian" (independent entries of zero mean and
+            unit variance, the last without bound), "sphere" (uniform on the Frobenius sphere of radius √(n p), also of
+            unit variances), or any random vector of dimension n p, which fills Z row by row; then its mean and
+            covariance count too. With one scale for all entries, costs and gradients by simulation draw no more than
+            n + p + 2 numbers a step for "gaussian" and "sphere".
         on_input: whether Δ acts on [x; u], p = n+m, instead of x, p = n.
 
     Raises:
@@ -128,13 +139,21 @@ class DensePerturbation(AbstractPerturbation):
         shape, scales = (horizon, *self._shape(M)), self.scales(M, horizon)
         if self.law is not None:
             Z = self._vector(M).sample(key, horizon).reshape(shape)
-        elif self.kind == "sphere":
-            normal = jax.random.normal(key, shape, scales.dtype)
-            Z = normal * jnp.sqrt(shape[1] * shape[2] / jnp.sum(normal**2, axis=(-2, -1), keepdims=True))
+        elif self.kind in BY_PRODUCTS:
+            Z = jax.random.normal(key, shape, scales.dtype)
+            if self.kind == "sphere":
+                Z = Z * jnp.sqrt(shape[1] * shape[2] / jnp.sum(Z**2, axis=(-2, -1), keepdims=True))
         else:
             Z = SCALAR_LAWS[self.kind].sample(key, shape, scales.dtype)
         matrices = scales * Z
         return DenseDraws(matrices if self.mean_map is None else matrices + self._location(M, horizon))
+
+    def sample_along(self, key: Key[Array, ""], M: Array, horizon: int) -> PathDraws:
+        values = as_array("scale", evaluate_map(self.scale, M, "scale"))
+        if self.kind not in BY_PRODUCTS or values.ndim > 1:
+            return self.sample(key, M, horizon)
+        location = None if self.mean_map is None else self._location(M, horizon)
+        return BY_PRODUCTS[self.kind](key, location, jnp.broadcast_to(values, (horizon,)), *self._shape(M))
 
     def _location(self, M: Array, horizon: int) -> Array:
         if self.mean_map is None:
@@ -175,6 +194,8 @@ class DensePerturbation(AbstractPerturbation):
         if largest is None or means is None:
             return None
         entrywise = jnp.broadcast_to(largest[..., None, None] if largest.ndim < 2 else largest, (horizon, n, p))
+        if self.kind == "gaussian":
+            return None
         if self.kind in SCALAR_LAWS:
             total = SCALAR_LAWS[self.kind].bound * jnp.sqrt(jnp.sum(entrywise**2, axis=(-2, -1)))
         else:
