@@ -141,7 +141,7 @@ WRONG = {
         "no function": (lambda: pc.Function(3.0), "f", "callable"),
         "parameters as text": (lambda: pc.Function(drawn, {"rate": "high"}), "params", "str"),
         "negative scale": (lambda: pc.DensePerturbation(-1.0), "scale", "absolute value"),
-        "unknown law": (lambda: pc.DensePerturbation(1.0, law="gaussian"), "law", "'gaussian'"),
+        "unknown law": (lambda: pc.DensePerturbation(1.0, law="cauchy"), "law", "'cauchy'"),
         "law as a matrix": (lambda: pc.DensePerturbation(1.0, law=eye), "law", "random vector"),
         "one direction": (lambda: pc.DirectionalPerturbation(eye, 1.0), "directions", "[D]"),
         "two scales": (lambda: perturbed(pc.DirectionalPerturbation(eye[None], np.ones(2))), "scale", "(2,)"),

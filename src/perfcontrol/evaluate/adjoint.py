@@ -24,7 +24,7 @@ from perfcontrol.evaluate.rollout import (
     input_adjoint,
     input_term,
     lanes,
-    sample_path,
+    sample_along,
 )
 from perfcontrol.policy import feedforward_adjoint
 from perfcontrol.problem import PerformativeProblem, check_problem
@@ -132,7 +132,7 @@ def mean_path_gradient(
     policy, reacting = problem.structure.lift(M), problem.structure.lift(deployed)
 
     def one(path_key: Array) -> Array:
-        return path_gradient(problem, sample_path(problem, policy, reacting, path_key, along=True))
+        return path_gradient(problem, sample_along(problem, policy, reacting, path_key))
 
     return jnp.mean(over_paths(problem, one, key, samples, along=True), axis=0)
 

@@ -28,7 +28,7 @@ class Path(eqx.Module):
     x: Float[Array, "T1 n"]
     u: Float[Array, "T1 m"]
     w: Float[Array, "T n"]
-    draws: PathDraws
+    draws: Any  # Draws, or PathDraws from `sample_along`
 
 
 class Trajectories(eqx.Module):
@@ -75,22 +75,28 @@ def input_adjoint(B: Matrix, y: Float[Array, "T n"]) -> Float[Array, "T m"]:
     return y @ B if B.ndim == 2 else jnp.einsum("tnm,tn->tm", B, y)
 
 
-def draw_path(
-    problem: PerformativeProblem, deployed: Array, key: Key[Array, ""], along: bool = False
-) -> tuple[Array, Array, PathDraws]:
-    """Initial state (n,), noise (T, n) and perturbations of one path, or good for it alone; `deployed` is lifted."""
+def draw_path(problem: PerformativeProblem, deployed: Array, key: Key[Array, ""]) -> tuple[Array, Array, Draws]:
+    """Initial state (n,), noise (T, n) and perturbations of one path; `deployed` is lifted."""
+    x0, w, perturbation_key = _draw_noise(problem, deployed, key)
+    return x0, w, problem.perturbation.sample(perturbation_key, deployed, problem.horizon)
+
+
+def _draw_noise(problem: PerformativeProblem, deployed: Array, key: Key[Array, ""]) -> tuple[Array, Array, Array]:
     initial_key, noise_key, perturbation_key = jax.random.split(key, 3)
     x0 = problem.initial_state.sample(initial_key, 1)[0].astype(deployed.dtype)
-    w = problem.noise_under(deployed).sample(noise_key, problem.horizon).astype(deployed.dtype)
-    sample = problem.perturbation.sample_along if along else problem.perturbation.sample
-    return x0, w, sample(perturbation_key, deployed, problem.horizon)
+    return x0, problem.noise_under(deployed).sample(noise_key, problem.horizon).astype(deployed.dtype), perturbation_key
 
 
-def sample_path(
-    problem: PerformativeProblem, policy: Array, deployed: Array, key: Key[Array, ""], along: bool = False
-) -> Path:
-    """One path; `policy` and `deployed` are lifted. Its draws serve for itself and its gradient alone if `along`."""
-    return run_path(problem, policy, *draw_path(problem, deployed, key, along))
+def sample_path(problem: PerformativeProblem, policy: Array, deployed: Array, key: Key[Array, ""]) -> Path:
+    """One path; `policy` and `deployed` are lifted."""
+    return run_path(problem, policy, *draw_path(problem, deployed, key))
+
+
+def sample_along(problem: PerformativeProblem, policy: Array, deployed: Array, key: Key[Array, ""]) -> Path:
+    """A path of the same law whose perturbations serve for its cost and its gradient alone, and are drawn for less."""
+    x0, w, perturbation_key = _draw_noise(problem, deployed, key)
+    draws = problem.perturbation.sample_along(perturbation_key, deployed, problem.horizon)
+    return run_path(problem, policy, x0, w, draws)
 
 
 def run_path(problem: PerformativeProblem, policy: Array, x0: Array, w: Array, draws: PathDraws) -> Path:
@@ -148,7 +154,7 @@ def _path_costs(problem: PerformativeProblem, M: Array, deployed: Array, key: Ar
     policy, reacting = problem.structure.lift(M), problem.structure.lift(deployed)
 
     def one(index: Array) -> Array:
-        path = sample_path(problem, policy, reacting, jax.random.fold_in(key, index), along=True)
+        path = sample_along(problem, policy, reacting, jax.random.fold_in(key, index))
         return jnp.sum(problem.cost.path_cost(path.x, path.u))
 
     return jax.lax.map(one, jnp.arange(samples), batch_size=min(lanes(problem, along=True), samples))
