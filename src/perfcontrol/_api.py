@@ -59,6 +59,7 @@ from perfcontrol.random_vectors import (
     TruncatedGaussian,
     Uniform,
 )
+from perfcontrol.reports import Report, report
 from perfcontrol.response import SampleAverage, best_response, estimate_response, residual
 from perfcontrol.sets import (
     AbstractSet,
@@ -189,6 +190,7 @@ __all__ = [
     "Rademacher",
     "ReactionTest",
     "RepeatedBlock",
+    "Report",
     "Result",
     "Rigorous",
     "RowSimplex",
@@ -236,6 +238,7 @@ __all__ = [
     "plotting",
     "price_of_stability",
     "recover_noise",
+    "report",
     "residual",
     "rrm_error_bound",
     "rsgd_error_bound",

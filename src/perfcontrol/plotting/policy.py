@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
+from perfcontrol._checks import fail
 from perfcontrol.plotting.style import SIGNED, styled
 from perfcontrol.plotting.subjects import input_names, panels, plain, state_names
 from perfcontrol.problem import PerformativeProblem, check_problem
@@ -13,25 +14,30 @@ WRITTEN = 60  # entries up to which each is written into its cell
 NAMED = 24  # columns up to which each has its name
 
 
-def plot_policy(problem: PerformativeProblem, M: Any, *, ax: Any = None) -> Axes:
+def plot_policy(problem: PerformativeProblem, M: Any, *, limit: float | None = None, ax: Any = None) -> Axes:
     """The policy lag by lag: the entry in row j and column k of lag i is what w_{t-i}[k] adds to u_t[j].
 
     Args:
         problem: the problem.
         M: free policy parameters, `problem.policy_shape`; the lifted policy is drawn.
+        limit: of the colours, -limit to limit, the same for policies to be compared; None for the largest entry.
         ax: Matplotlib axes; None makes a figure.
 
     Returns:
         The axes.
 
     Raises:
-        InputError: a policy of the wrong shape.
+        InputError: a policy of the wrong shape; a limit that is not positive.
     """
     lifted = np.asarray(check_problem(problem).lift(M))
     lags, rows, states = lifted.shape
     columns = lags * states
     stack = np.concatenate(list(lifted), axis=1)
     largest = float(np.max(np.abs(stack), initial=0.0)) or 1.0
+    if limit is not None:
+        largest = float(limit)
+        if not 0 < largest < np.inf:
+            raise fail("limit", f"{limit}", "be positive", "Pass the largest entry of the policies, or leave it out.")
     with styled():
         size = min(max(2.2, 1.1 + 0.45 * columns), 7.4), min(max(1.3, 0.9 + 0.34 * rows), 5.6)
         axes = panels(ax, 1, size)[0]

@@ -69,7 +69,7 @@ def plot_trajectories(
 def _signal(axes: Axes, values: np.ndarray, band: float, policy: str, look: Look) -> None:
     low, middle, high = np.quantile(values, [(1 - band) / 2, 0.5, (1 + band) / 2], axis=0)
     t = np.arange(len(middle))
-    axes.fill_between(t, low, high, color=look.colour, alpha=0.10, linewidth=0)
+    axes.fill_between(t, low, high, color=look.colour, alpha=0.07, linewidth=0)
     axes.plot(t, middle, color=look.colour, linestyle=look.line, linewidth=1.1, label=plain(policy))
     for edge in (low, high):  # shades that lie over one another tell nobody apart
         axes.plot(t, edge, color=look.colour, linestyle=look.line, linewidth=0.9)
