@@ -1,5 +1,6 @@
 """A report says the numbers of the library, in a page that needs nothing else, whatever the problem is."""
 
+import json
 import math
 from pathlib import Path
 
@@ -7,8 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 import perfcontrol as pc
+from perfcontrol.cli import app
 from tests.reports.pages import check
 from tests.solvers.problems import performative_prediction
 from tests.theory.problems import order_problem, random_problem
@@ -119,6 +122,21 @@ def test_what_only_simulation_knows_is_reported_with_standard_errors():
     assert "±" in page.sections["costs"] and "standard errors" in page.sections["costs"]
     assert closest(page.values, exact.cost_stable) < 0.2
     assert "known only by samples" in page.sections["landscape"]
+
+
+def test_run_that_was_kept_is_reported_from_its_folder_by_the_command_line(tmp_path, monkeypatch):
+    monkeypatch.setattr("perfcontrol.cli.report.configure_jax", lambda: None)
+    problem = reacting()
+    solver = pc.RSGD(steps=40, step_size=0.02)
+    solution = pc.solve(problem, solver, key=jax.random.key(5), every=4)
+    pc.save(pc.Run(problem, solution, solver, seed=5, every=4), tmp_path / "run")
+    done = CliRunner().invoke(app, ["report", str(tmp_path / "run"), "--samples", "32", "--json"])
+    assert done.exit_code == 0, done.output
+    assert json.loads(done.stdout)["missing"] == {}
+    page = check((tmp_path / "run" / "report.html").read_text(encoding="utf-8"))
+    assert "The run “RSGD” ended after 40 steps" in page.source
+    assert "seed 5," in page.sections["computed"]
+    assert page.headings[0][1] == "Performative control: run"
 
 
 def test_infinite_horizon_is_reported_per_stage():

@@ -44,12 +44,14 @@ def plot_certificate(certificate: Certificate, *, ax: Any = None) -> Axes:
             shown = shares[shares > 0]
             floor = max(shown.min() if shown.size else limit, (shown.max() if shown.size else limit) * 10.0**-DECADES)
             axes.set_yscale("log")
-            axes.set_ylim(min(floor, limit or floor) / 2, 3 * top)
+            low = min(floor, limit or floor) / 2
+            axes.set_ylim(low, 3 * top * (3 * top / low) ** 0.35)  # room for the legend
         axes.set_xlim(-0.7, len(shares) - 0.3)
         axes.set_xlabel("time $t$")
         axes.set_ylabel("left side")
         axes.set_title(f"{certificate.kind}: {'holds' if certificate.holds else 'does not hold'}")
-        axes.legend(loc="best")
+        axes.set_axisbelow(True)
+        axes.legend(loc="upper left")
     return axes
 
 

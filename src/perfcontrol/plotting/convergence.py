@@ -14,7 +14,7 @@ from perfcontrol.solvers import Result, Solution
 SHORT = 100  # steps up to which the axis is linear
 
 
-def plot_convergence(solutions: Any, reference: Any = None, *, every: int = 1, ax: Any = None) -> Axes:
+def plot_convergence(solutions: Any, reference: Any = None, *, every: Any = 1, ax: Any = None) -> Axes:
     """Distance ‖M_n - reference‖_F of the iterates of several runs, against the step; where a run failed, a cross.
 
     Of a batch of runs (a solution of `vmap`, over keys for example) the median and the band from 10 to 90 %.
@@ -23,7 +23,7 @@ def plot_convergence(solutions: Any, reference: Any = None, *, every: int = 1, a
         solutions: one `Solution`, or several by name, with iterates as their history (`record` left out).
         reference: a policy, such as the stable one; None for what the first run that succeeded found, in which its own
             last steps vanish.
-        every: as it was given to `pc.solve`.
+        every: as it was given to `pc.solve`; by name where it was not the same for all.
         ax: Matplotlib axes; None makes a figure.
 
     Returns:
@@ -34,14 +34,15 @@ def plot_convergence(solutions: Any, reference: Any = None, *, every: int = 1, a
     """
     named = as_solutions(solutions)
     target = _reference(named, reference)
-    every = check_integer("every", every, 1)
+    strides = every if isinstance(every, Mapping) else dict.fromkeys(named, every)
     styles = looks(named)
     with styled():
         axes = panels(ax, 1, (4.2, 2.8))[0]
         longest = 0
         for name, solution in named.items():
-            errors, ended = distances(name, solution, target, every)
-            n = every * np.arange(errors.shape[-1])
+            stride = check_integer("every", strides.get(name, 1), 1)
+            errors, ended = distances(name, solution, target, stride)
+            n = stride * np.arange(errors.shape[-1])
             longest = max(longest, int(n[-1]))
             look = styles[name]
             style: Any = {"color": look.colour, "linestyle": look.line}

@@ -12,6 +12,7 @@ from perfcontrol.problem import PerformativeProblem, check_problem
 
 WRITTEN = 60  # entries up to which each is written into its cell
 NAMED = 24  # columns up to which each has its name
+LETTERS = 18  # of a name that are shown
 
 
 def plot_policy(problem: PerformativeProblem, M: Any, *, limit: float | None = None, ax: Any = None) -> Axes:
@@ -39,8 +40,7 @@ def plot_policy(problem: PerformativeProblem, M: Any, *, limit: float | None = N
         if not 0 < largest < np.inf:
             raise fail("limit", f"{limit}", "be positive", "Pass the largest entry of the policies, or leave it out.")
     with styled():
-        size = min(max(2.2, 1.1 + 0.45 * columns), 7.4), min(max(1.3, 0.9 + 0.34 * rows), 5.6)
-        axes = panels(ax, 1, size)[0]
+        axes = panels(ax, 1, heat_map_size(problem))[0]
         edges = np.arange(columns + 1), np.arange(rows + 1)
         mesh = axes.pcolormesh(
             *edges, stack, cmap=SIGNED, vmin=-largest, vmax=largest, edgecolors="white", linewidth=0.4
@@ -52,9 +52,28 @@ def plot_policy(problem: PerformativeProblem, M: Any, *, limit: float | None = N
             for (j, k), value in np.ndenumerate(stack):
                 shade = "white" if abs(value) > 0.62 * largest else "black"
                 axes.text(k + 0.5, j + 0.5, f"{value:.2g}", ha="center", va="center", fontsize=7, color=shade)
+        else:
+            axes.figure.colorbar(mesh, ax=axes, shrink=0.9, pad=0.02, aspect=12)
         _label(axes, problem, lags)
-        axes.figure.colorbar(mesh, ax=axes, shrink=0.9, pad=0.02, aspect=12)
     return axes
+
+
+def heat_map_size(problem: PerformativeProblem) -> tuple[float, float]:
+    """Width and height in inches that suit `plot_policy`."""
+    lags, rows, states = problem.lifted_shape
+    names = [_short(name) for name in state_names(problem)]
+    below = 0.07 * max(map(len, names)) if _turned(problem, names) else 0.0
+    return min(max(2.2, 1.1 + 0.45 * lags * states), 7.0), min(max(1.3, 1.0 + 0.34 * rows), 5.6) + below
+
+
+def _turned(problem: PerformativeProblem, names: list[str]) -> bool:
+    """Whether names of the states are too long to stand side by side."""
+    columns = problem.lifted_shape[0] * len(names)
+    return columns <= NAMED and max(map(len, names)) * 0.075 > max(0.42, 1.6 / columns)
+
+
+def _short(name: str) -> str:
+    return plain(name if len(name) <= LETTERS else name[: LETTERS - 1] + "…")
 
 
 def _label(axes: Axes, problem: PerformativeProblem, lags: int) -> None:
@@ -63,13 +82,13 @@ def _label(axes: Axes, problem: PerformativeProblem, lags: int) -> None:
     axes.tick_params(length=0)
     for spine in axes.spines.values():
         spine.set_visible(False)
-    named = input_names(problem) if rows <= NAMED else [""] * rows
-    axes.set_yticks(np.arange(rows) + 0.5, [plain(name) for name in named])
+    named = [_short(name) for name in input_names(problem)] if rows <= NAMED else [""] * rows
+    axes.set_yticks(np.arange(rows) + 0.5, named)
     axes.set_ylabel("input")
     if lags * states <= NAMED:
-        names = [plain(name) for name in state_names(problem)]
-        turned = 0 if max(map(len, names)) <= 4 else 90
-        axes.set_xticks(np.arange(lags * states) + 0.5, names * lags, rotation=turned)
+        names = [_short(name) for name in state_names(problem)]
+        rotation = 90 if _turned(problem, names) else 0
+        axes.set_xticks(np.arange(lags * states) + 0.5, names * lags, rotation=rotation)
         axes.set_xlabel("disturbance of")
     else:
         axes.set_xticks([])

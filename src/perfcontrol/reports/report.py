@@ -10,6 +10,8 @@ from typing import Any
 
 from perfcontrol._checks import check_instance, check_integer, fail
 from perfcontrol._files import written_whole
+from perfcontrol._printing import public_name
+from perfcontrol.files import Run
 from perfcontrol.problem import PerformativeProblem, check_problem
 from perfcontrol.solvers import Solution
 
@@ -45,12 +47,12 @@ class Report:
 
 
 def report(
-    problem: PerformativeProblem,
+    problem: Any,
     solution: Any = None,
     path: Any = None,
     *,
     title: str = "Performative control: a report",
-    seed: int = 0,
+    seed: int | None = None,
     samples: int = 1024,
     seconds: float | int | None = None,
     progress: Callable[[str, float], None] | None = None,
@@ -58,15 +60,15 @@ def report(
     """One page about a problem: what it is, whether a stable policy exists and how that is known, what naive, stable
     and optimal policy cost, how methods converge, what states, inputs and costs do, and what it all rests on.
 
-    A solution does not hold its problem, so the problem comes first. What cannot be had (moments that are not known, no
-    stable policy, an infinite horizon) is said in its section, with the reason.
+    A solution does not hold its problem, so the problem comes first; a run that was kept holds both. What cannot be had
+    (moments that are not known, no stable policy, an infinite horizon) is said in its section, with the reason.
 
     Args:
-        problem: the problem.
+        problem: the problem; or a run, `pc.load(folder)`, whose solution and seed are then used.
         solution: of `pc.solve`, or several by name: their ends, policies and convergence are shown, too.
         path: of the file to write, such as "report.html"; None writes none.
         title: of the page.
-        seed: root of all randomness.
+        seed: root of all randomness; None for that of the run, or 0.
         samples: simulated paths of each policy.
         seconds: no new part is begun after so long; None for no limit. What was left out is named.
         progress: called with the name of a part, and 0 when it begins, 1 when it ends.
@@ -89,15 +91,21 @@ def report(
             "be the problem",
             "Call pc.report(problem, solution): no solution holds its problem.",
         )
-    check_problem(problem)
-    runs = _runs(problem, solution)
-    check_integer("seed", seed, 0)
+    every: dict[str, int] = {}
+    if isinstance(problem, Run):
+        seed = problem.seed if seed is None else seed
+        name = "run" if problem.solver is None else public_name(problem.solver)
+        every[name] = problem.every
+        others = {} if solution is None else _runs(problem.problem, solution)
+        problem, solution = problem.problem, {name: problem.solution} | others
+    runs = _runs(check_problem(problem), solution)
+    seed = check_integer("seed", 0 if seed is None else seed, 0)
     check_integer("samples", samples, 2)
     if seconds is not None and not seconds >= 0:
         raise fail("seconds", f"{seconds}", "be a time, or None", "Pass 600.0, or leave it out.")
     if path is not None:
         _check_target(Path(path))
-    found = gather(problem, runs, seed=seed, samples=samples, seconds=seconds, progress=progress)
+    found = gather(problem, runs, every=every, seed=seed, samples=samples, seconds=seconds, progress=progress)
     byline = f"perfcontrol, {datetime.date.today().isoformat()}, seed {seed}"
     page = document(title, byline, in_short(found), sections(found))
     made = Report(page, dict(found.why_not), dict(found.seconds))

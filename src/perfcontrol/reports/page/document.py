@@ -47,6 +47,10 @@ svg * { stroke-linejoin: round; stroke-linecap: butt; }
 .legend span { margin-right: 1.4rem; white-space: nowrap; }
 .legend svg { display: inline-block; width: 2.6rem; vertical-align: middle; }
 code { font-size: .92em; }
+@media (max-width: 36rem) {
+  table { font-size: .88rem; }
+  th, td { padding-right: .6rem; overflow-wrap: anywhere; min-width: 4.5rem; }
+}
 @media print {
   :root { --page: #ffffff; --ink: #000000; --muted: #444444; --grid: #dddddd; --line: #bbbbbb; --box: #ffffff;
     --link: #000000; --stable: #c0392b; --optimal: #0072b2; --naive: #b97c00; }

@@ -3,7 +3,6 @@
 import numpy as np
 
 from perfcontrol._printing import number as short
-from perfcontrol.reports.page.answers import MEANINGS
 from perfcontrol.reports.page.figures import Gallery, legend
 from perfcontrol.reports.page.findings import STEPS, Findings
 from perfcontrol.reports.page.markup import (
@@ -48,8 +47,7 @@ def policies(found: Findings, gallery: Gallery) -> Html:
         "orange negative, on one scale for all."
     )
     norms = [f"‖M‖_F is {np.linalg.norm(M):.4g} for {name}" for name, M in found.policies.items()]
-    headings = [f"{name}: {MEANINGS.get(name, 'of the run that was given')}" for name in found.policies]
-    return Html(body + figures(gallery.policies(), f"{'; '.join(norms)}.", headings))
+    return Html(body + figures(gallery.policies(), f"{'; '.join(norms)}.", list(found.policies)))
 
 
 def _no_paths(found: Findings) -> Html:
@@ -127,9 +125,9 @@ def landscape(found: Findings, gallery: Gallery) -> Html:
     caption = (
         f"Shades: costs, darker is dearer. {plane}Then the line through stable and optimal policy: each column is a "
         "world, and what is deployed stands on the diagonal; the dashed best response crosses it at the stable policy, "
-        "arrows are retraining. Last, the same as curves: black in each policy's own world, red in that of the stable, "
-        "blue in that of the optimal policy. Circle: stable; star: optimal; square: naive. Hatched: no finite cost; "
-        "blank: not feasible."
+        "arrows are retraining. Last, the same as curves: the thick one in each policy's own world, red in that of the "
+        "stable, blue in that of the optimal policy. Circle: stable; star: optimal; square: naive. Hatched: no finite "
+        "cost; blank: not feasible."
     )
     return figures(gallery.landscape(), caption)
 

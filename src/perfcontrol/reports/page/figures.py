@@ -10,7 +10,7 @@ from perfcontrol.plotting.certificate import plot_certificate
 from perfcontrol.plotting.convergence import plot_convergence
 from perfcontrol.plotting.costs import plot_costs
 from perfcontrol.plotting.landscape_figure import VIEWS, draw_view
-from perfcontrol.plotting.policy import plot_policy
+from perfcontrol.plotting.policy import heat_map_size, plot_policy
 from perfcontrol.plotting.style import looks
 from perfcontrol.plotting.trajectories import chosen_signals, plot_trajectories, signal
 from perfcontrol.reports.page.findings import Findings
@@ -38,14 +38,14 @@ class Gallery:
             last = float(np.linalg.norm(np.asarray(run.M) - (np.asarray(run.M) if stable is None else stable)))
             parts.append(f"{name} after {int(run.steps)} steps at distance {last:.2g}")
         alt = f"Distance to the stable policy against the step, on a logarithmic axis: {'; '.join(parts)}."
-        return [self._drawn(4.6, 2.9, alt, lambda axes: plot_convergence(found.convergence, stable, ax=axes))]
+        plot = lambda axes: plot_convergence(found.convergence, stable, every=found.every, ax=axes)  # noqa: E731
+        return [self._drawn(4.0, 2.8, alt, plot)]
 
     def policies(self) -> list[Drawing]:
         """A heat map of each policy, all on one scale of colours."""
         found = self.found
         lags, inputs, states = found.problem.lifted_shape
-        width = min(max(2.6, 1.2 + 0.42 * lags * states), 6.4)
-        height = min(max(1.4, 0.95 + 0.3 * inputs), 4.6)
+        size = heat_map_size(found.problem)
         lifted = {name: np.asarray(found.problem.lift(M)) for name, M in found.policies.items()}
         limit = max(float(np.max(np.abs(M))) for M in lifted.values()) or None
         drawn = []
@@ -57,7 +57,7 @@ class Gallery:
             )
             free = found.policies[name]
             plot = lambda axes, free=free: plot_policy(found.problem, free, limit=limit, ax=axes)  # noqa: E731
-            drawn.append(self._drawn(width, height, alt, plot))
+            drawn.append(self._drawn(*size, alt, plot))
         return drawn
 
     def trajectories(self) -> list[Drawing]:
@@ -80,7 +80,7 @@ class Gallery:
         found = self.found
         means = ", ".join(f"{np.mean(np.asarray(paths.cost)):.4g} under {name}" for name, paths in found.paths.items())
         alt = f"Histogram of the cost over {found.samples} simulated paths of each policy. Means: {means}."
-        return [self._drawn(4.6, 2.9, alt, lambda axes: plot_costs(found.problem, found.paths, ax=axes))]
+        return [self._drawn(4.0, 2.8, alt, lambda axes: plot_costs(found.problem, found.paths, ax=axes))]
 
     def contributions(self, certificate: Certificate) -> list[Drawing]:
         """One figure."""

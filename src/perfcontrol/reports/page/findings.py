@@ -37,13 +37,14 @@ class Cost(NamedTuple):
 class Findings:
     """All that the sections say. Parts that could not be had are absent, and `why_not` names them with the reason.
 
-    runs: solutions that were given, by name. policies: naive, stable, optimal as far as known, then those of the runs
-    that are none of these; `same` says which one a run found. convergence: runs by name, with their histories. paths:
-    of each policy in its own world. seconds: of each part.
+    runs: solutions that were given, by name; every: steps between the entries of their histories. policies: naive,
+    stable, optimal as far as known, then those of the runs that are none of these; `same` says which one a run found.
+    convergence: runs by name, with their histories. paths: of each policy in its own world. seconds: of each part.
     """
 
     problem: PerformativeProblem
     runs: dict[str, Solution]
+    every: dict[str, int]
     seed: int
     samples: int
     exact: bool
@@ -100,17 +101,18 @@ def gather(
     problem: PerformativeProblem,
     runs: dict[str, Solution],
     *,
+    every: dict[str, int],
     seed: int,
     samples: int,
     seconds: float | int | None,
     progress: Callable[[str, float], None] | None,
 ) -> Findings:
     """Everything that the report says, as far as it is possible in the time."""
-    found = Findings(problem, runs, seed, samples, is_exact(problem))
+    found = Findings(problem, runs, every, seed, samples, is_exact(problem))
     clock = Clock(found, seconds, progress)
     (_exact_policies if found.exact else _sampled_policies)(found, clock)
     _given_policies(found)
-    with clock.part("costs") as now:
+    with clock.part("costs", optional=not found.exact) as now:
         if now:
             _costs(found)
     with clock.part("convergence") as now:

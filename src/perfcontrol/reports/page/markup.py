@@ -24,10 +24,13 @@ SCRIPT = re.compile(r"((?<!\w)\w|[∇‖)\]])([_^])(\{[^{}]+\}|\w+)")
 
 
 def text(value: Any) -> Html:
-    """Anything as escaped text; HTML as it is. x_t, M^PS and ‖M‖_F are set as such."""
+    """Anything as escaped text; HTML as it is. x_t, M^PS, ‖M‖_F and `code` are set as such."""
     if isinstance(value, Html):
         return value
-    return Html(SCRIPT.sub(_script, escape(str(value))))
+    pieces = escape(str(value)).split("`")  # every other one stood between backticks
+    return Html(
+        "".join(SCRIPT.sub(_script, one) if i % 2 == 0 else f"<code>{one}</code>" for i, one in enumerate(pieces))
+    )
 
 
 def _script(match: re.Match[str]) -> str:

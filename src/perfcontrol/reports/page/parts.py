@@ -33,11 +33,13 @@ def _equations(problem: PerformativeProblem) -> list[Html]:
         if problem.perturbation.columns(problem.state_size, problem.input_size) > problem.state_size
         else "x_t"
     )
+    H = problem.memory
+    further = "" if H == 1 else f"{' +' if H == 2 else ' + ... +'} M[{H - 1}] w_{{t-{H}}}"
     gain = "−K x_t + " if problem.has_gain else ""
     cost = "the sum of c_t(x_t, u_t) over t = 0..T" if problem.is_finite else "the average of c(x_t, u_t)"
     return [
         joined([f"x_{{t+1}} = A x_t + B u_t + Δ_t {z} + w_t, with Δ_t from the law that the deployed policy makes"]),
-        joined([f"u_t = {gain}M[0] w_{{t-1}} + ... + M[{problem.memory - 1}] w_{{t-{problem.memory}}}"]),
+        joined([f"u_t = {gain}M[0] w_{{t-1}}{further}"]),
         joined([f"the cost C_T(M; M') is the expectation of {cost}, for the policy M in the world that M' makes"]),
     ]
 
