@@ -41,7 +41,7 @@ def observed(steps, jump=0.0):
 
 
 problem = build()
-solution = pc.Solution(M, pc.Result.success, np.asarray(0), None, {})
+solution = pc.Solution(jax.numpy.asarray(M), pc.Result.success, jax.numpy.asarray(0), None, {})
 plant = controlled()
 begun = plant.init()
 DATA = np.zeros((2, 4, 2)), np.zeros((2, 4, 2)), np.zeros((2, 1, 2, 2))  # states, inputs, deployed policies
@@ -320,6 +320,12 @@ WRONG = {
         "unknown set": (lambda: pc.experiments.stock_market(feasible_set="box"), "feasible_set", "'box'"),
         "order of sensitivities": (lambda: pc.experiments.stock_sensitivities(3), "order", "got 3"),
     },
+    "reports": {
+        "solution without its problem": (lambda: pc.report(solution), "problem", "pc.report(problem, solution)"),
+        "policy for a solution": (lambda: pc.report(problem, M), "solution", "pc.solve"),
+        "one path": (lambda: pc.report(problem, samples=1), "samples", "at least 2"),
+        "no time": (lambda: pc.report(problem, seconds=nan), "seconds", "nan"),
+    },
     "files": {
         "nothing that is kept": (lambda: pc.save(eye, "a.npz"), "thing", "a problem, a solution, or a run"),
         "problem under another ending": (lambda: pc.save(problem, "a.npz"), "path", "a.toml"),
@@ -350,6 +356,7 @@ GIVEN_BACK = {
     "PriceOfStability",
     "Decision",
     "ReactionTest",
+    "Report",
     "Solution",
     "StateMoments",
     "Trajectories",

@@ -157,16 +157,26 @@ def test_certain_costs_are_drawn_too():
     pc.plotting.plot_costs(problem, [[[0.0]]], key=KEY, samples=4).figure.canvas.draw()
 
 
-@pytest.mark.parametrize("strength", [1e-5, 1.0], ids=["holds", "does not hold"])
-def test_certificate_draws_its_contributions_their_sum_and_the_limit(strength):
-    certificate = pc.certify(random_problem(0, strength=strength), "rigorous")
+@pytest.mark.parametrize("limit", [0.5, 2.0, 1e3], ids=["does not hold", "holds", "holds by far"])
+def test_certificate_draws_its_contributions_their_sum_and_the_limit_where_it_is_near(limit):
+    shares = np.array([0.0, 0.4, 0.6])
+    certificate = pc.Certificate("rigorous", "", True, holds=limit > 1, lhs=1.0, rhs=limit, contributions=shares)
     axes = pc.plotting.plot_certificate(certificate)
-    bars = [bar.get_height() for bar in axes.containers[0]]
-    assert_close(bars, certificate.contributions)
-    running, limit = (np.asarray(line.get_ydata()) for line in axes.lines)
-    assert running[-1] == pytest.approx(certificate.lhs) and limit[0] == pytest.approx(certificate.rhs)
-    assert axes.get_title() == f"rigorous: {'holds' if certificate.holds else 'does not hold'}"
+    assert_close([bar.get_height() for bar in axes.containers[0]], shares)
+    drawn = [np.asarray(line.get_ydata()) for line in axes.lines]
+    if limit < 20:
+        assert_close(drawn[0], [0.0, 0.4, 1.0])
+        assert drawn[1][0] == limit and axes.get_ylim()[1] > limit
+    else:
+        assert drawn == []
+    assert ("does not" in axes.get_title()) == (limit < 1)
     axes.figure.canvas.draw()
+
+
+def test_contributions_add_up_to_the_left_side():
+    certificate = pc.certify(random_problem(0, strength=1e-5), "rigorous")
+    bars = [bar.get_height() for bar in pc.plotting.plot_certificate(certificate).containers[0]]
+    assert sum(bars) == pytest.approx(certificate.lhs)
 
 
 def test_what_does_not_fit_is_refused():

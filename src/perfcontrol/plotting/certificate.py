@@ -10,13 +10,14 @@ from perfcontrol.plotting.style import LOOKS, styled
 from perfcontrol.plotting.subjects import panels
 from perfcontrol.theory import Certificate
 
-DECADES = 6  # shown below the largest contribution
+COMPARABLE = 20.0  # the ratio of both sides up to which they are shown on one axis
 
 
 def plot_certificate(certificate: Certificate, *, ax: Any = None) -> Axes:
-    """What each sensitivity ε_t adds to the left side, their running sum, and the right side that it must stay below.
+    """What each sensitivity ε_t adds to the left side of a certificate.
 
-    Contributions more than six decades below the largest are not shown.
+    Where both sides are of one size (up to a factor of 20), also their running sum, and the right side that it must
+    stay below. The title says both sides.
 
     Args:
         certificate: with contributions, as of `pc.certify(problem, "rigorous")` or "paper".
@@ -30,28 +31,25 @@ def plot_certificate(certificate: Certificate, *, ax: Any = None) -> Axes:
     """
     certificate = check_instance("certificate", certificate, Certificate, "pc.certify(problem, 'rigorous')")
     shares = contributions_of(certificate)
-    total, limit = float(shares.sum()), float(certificate.rhs or 0.0)
-    look = LOOKS["optimal"]
+    total, limit = float(certificate.lhs or 0.0), float(certificate.rhs or 0.0)
+    comparable = total > 0 and limit > 0 and max(total / limit, limit / total) <= COMPARABLE
     with styled():
         axes = panels(ax, 1, (4.2, 2.8))[0]
         t = np.arange(len(shares))
-        axes.bar(t, shares, width=0.85, color=look.colour, alpha=0.55, label=r"contribution of $\varepsilon_t$")
-        axes.step(t, np.cumsum(shares), where="mid", color=LOOKS["stable"].colour, label="sum so far")
-        if limit > 0:
+        axes.bar(
+            t, shares, width=0.85, color=LOOKS["optimal"].colour, alpha=0.6, label=r"contribution of $\varepsilon_t$"
+        )
+        if comparable:
+            axes.step(t, np.cumsum(shares), where="mid", color=LOOKS["stable"].colour, label="sum so far")
             axes.axhline(limit, color="#7F7F7F", linestyle=(0, (5, 2)), label="must stay below")
-        top = max(total, limit)
-        if top > 0:
-            shown = shares[shares > 0]
-            floor = max(shown.min() if shown.size else limit, (shown.max() if shown.size else limit) * 10.0**-DECADES)
-            axes.set_yscale("log")
-            low = min(floor, limit or floor) / 2
-            axes.set_ylim(low, 3 * top * (3 * top / low) ** 0.35)  # room for the legend
+            axes.set_ylim(top=1.5 * max(total, limit))  # room for the legend
+            axes.legend(loc="upper left", ncols=3, columnspacing=1.0, handlelength=1.5)
+        axes.set_axisbelow(True)
         axes.set_xlim(-0.7, len(shares) - 0.3)
         axes.set_xlabel("time $t$")
-        axes.set_ylabel("left side")
-        axes.set_title(f"{certificate.kind}: {'holds' if certificate.holds else 'does not hold'}")
-        axes.set_axisbelow(True)
-        axes.legend(loc="upper left")
+        axes.set_ylabel(r"contribution of $\varepsilon_t$")
+        sign, verdict = ("<", "holds") if certificate.holds else (r"\geq", "does not hold")
+        axes.set_title(f"{certificate.kind}: {total:.3g} ${sign}$ {limit:.3g}, {verdict}")
     return axes
 
 
