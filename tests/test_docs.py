@@ -67,6 +67,25 @@ def test_notebook_has_the_code_and_the_output_of_the_page():
     assert len({cell["id"] for cell in made["cells"]}) == len(made["cells"])
 
 
+COMING_FROM = sorted(page.stem for page in DOCS.glob("from-*.md") if "| Here |" in page.read_text("utf-8"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", COMING_FROM)
+def test_lines_of_the_tables_for_newcomers_run(name):
+    page = (DOCS / f"{name}.md").read_text("utf-8")
+    names = {}
+    exec(compile(re.search(r"```python\n(.*?)```", page, re.DOTALL)[1], name, "exec"), names)
+    cells = re.findall(r"^\|.*\| (`.*`) \|$", page, re.MULTILINE)
+    assert len(cells) >= 8
+    for line in [line for cell in cells for line in re.findall("`([^`]+)`", cell)]:
+        assert eval(line, names) is not None, line
+
+
+def test_there_is_a_page_for_each_kind_of_newcomer():
+    assert COMING_FROM == ["from-jax", "from-performative-prediction", "from-python-control"]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("case", cases.CASES)
 def test_case_study_prints_what_its_page_says(case):
