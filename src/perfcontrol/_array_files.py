@@ -46,7 +46,9 @@ def read_arrays(path: Path, form: str) -> tuple[dict[str, Any], dict[str, np.nda
         TypeError,
         AttributeError,
         EOFError,
-        NotImplementedError,
+        MemoryError,
+        OverflowError,
+        RuntimeError,  # encrypted, of an unknown compression, JSON nested too deeply
         zipfile.BadZipFile,
         zlib.error,
     ) as error:

@@ -1,6 +1,18 @@
 """The command line, one file a command. It alone sets JAX's global configuration."""
 
-from perfcontrol.cli import certify, new, report, reproduce, solve, stocks  # noqa: F401 - each adds its command
+from perfcontrol.cli import (  # noqa: F401 - each adds its command
+    certify,
+    compare,
+    new,
+    report,
+    reproduce,
+    resume,
+    schema,
+    simulate,
+    solve,
+    stocks,
+    sweep,
+)
 from perfcontrol.cli.app import app
 
 __all__ = ["app", "main"]

@@ -11,28 +11,42 @@ import typer
 from rich.console import Console
 from typer.core import TyperGroup
 
+ORDER = ("new", "solve", "certify", "simulate", "compare", "sweep", "resume", "report", "schema", "reproduce", "stocks")
+
 console = Console()
 errors = Console(stderr=True)
 
 
 class Commands(TyperGroup):
-    """The commands, none of which ends in a traceback because of what the system or the library refuses."""
+    """The commands in the order of their use, none of which ends in a traceback because of what the system or the
+    library refuses."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        return sorted(super().list_commands(ctx), key=lambda name: ORDER.index(name) if name in ORDER else len(ORDER))
 
     def invoke(self, ctx: Any) -> Any:
         try:
             with in_words("go on"):
                 return super().invoke(ctx)
-        except ValueError as error:
-            from perfcontrol._checks import InputError
-
-            if isinstance(error, InputError):
-                raise refuse(str(error)) from None
-            raise
+        except (ValueError, ArithmeticError, MemoryError, RuntimeError) as error:
+            raise _in_words_of_the_library(error) from None
 
 
-app = typer.Typer(
-    cls=Commands, no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None
-)
+def _in_words_of_the_library(error: Exception) -> Exception:
+    """The exit for what the library refuses, and for numbers or arrays that are too large; else the error itself."""
+    from perfcontrol._checks import InputError
+
+    first = str(error).split("\n")[0]
+    if isinstance(error, InputError):
+        return refuse(str(error))
+    if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in first or "Out of memory" in first:
+        return refuse(f"there is not enough memory for this: {first[:200]}. Use a shorter horizon or fewer samples.", 1)
+    if isinstance(error, OverflowError):
+        return refuse(first, 1)
+    return error
+
+
+app = typer.Typer(cls=Commands, no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None)
 
 
 class _Cache:

@@ -1,6 +1,7 @@
 """What the commands about a problem file share: reading it with changes, and carrying out what it asks for."""
 
 import contextlib
+import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -36,7 +37,9 @@ def plan_in(path: Path, settings: list[str] | None = None, seed: int | None = No
     return plan if seed is None else replace(plan, seed=seed)
 
 
-def solved(plan: "Plan", progress: Callable[[int, int], None], kinds: tuple[str, ...] = ()) -> "Run":
+def solved(
+    plan: "Plan", progress: Callable[[str, float], None], kinds: tuple[str, ...] = (), checkpoint: Path | None = None
+) -> "Run":
     """What a plan asks for, carried out; a failure is a result, too."""
     import jax
 
@@ -48,31 +51,41 @@ def solved(plan: "Plan", progress: Callable[[int, int], None], kinds: tuple[str,
     every = max(1, -(-solver.max_steps // RECORDED))
     key = jax.random.key(plan.seed)
     began = time.perf_counter()
-    found = solve(plan.problem, solver, plan.M0, key=key, every=every, throw=False, progress=progress)
+    found = solve(
+        plan.problem,
+        solver,
+        plan.M0,
+        key=key,
+        every=every,
+        throw=False,
+        progress=lambda done, total: progress("solving", done / total),
+        checkpoint=checkpoint,
+    )
     seconds = time.perf_counter() - began
-    rows = tuple(verdict_rows(plan.problem, kinds, key=key)) if kinds else ()
-    return Run(plan.problem, found, solver, plan.seed, plan.M0, every, rows, seconds=round(seconds, 3))
+    rows: list[dict[str, Any]] = []
+    for number, kind in enumerate(kinds):
+        progress("certifying", number / len(kinds))
+        rows += verdict_rows(plan.problem, (kind,), key=key)
+    return Run(plan.problem, found, solver, plan.seed, plan.M0, every, tuple(rows), seconds=round(seconds, 3))
 
 
 @contextlib.contextmanager
-def kept(folder: Path, plan: "Plan", **settings: Any) -> Iterator[None]:
-    """A folder that is this process's own; begun with the plan unless it was begun before with the same one."""
+def new_folder(folder: Path) -> Iterator[None]:
+    """Hold a folder that is empty."""
     from perfcontrol._checks import fail
-    from perfcontrol.files.locks import LOCK, locked
-    from perfcontrol.files.run import RECORD, begin
+    from perfcontrol._lock import NAME, locked
 
-    folder.mkdir(parents=True, exist_ok=True)
-    with locked(folder):
-        others = [entry.name for entry in folder.iterdir() if entry.name not in (LOCK, RECORD)]
-        if others or (folder / RECORD).exists():
+    with locked("out", folder):
+        others = sorted(entry.name for entry in folder.iterdir() if entry.name != NAME)
+        if others:
             remedy = f"Choose another folder, or go on there with `perfcontrol resume {folder}`."
-            raise fail("out", f"{folder}, which holds {others[0] if others else RECORD}", "be a new folder", remedy)
-        begin(folder, plan, **settings)
+            raise fail("out", f"{folder}, which holds {others[0]}", "be a new folder", remedy)
         yield
 
 
-def cost_of(problem: Any, M: Any, seed: int, samples: int = 4096) -> dict[str, float | None]:
-    """C(M; M): exact where moments are known, else estimated with its standard error."""
+def cost_of(problem: Any, M: Any, seed: int, samples: int = 4096) -> dict[str, Any]:
+    """C(M; M): exact where moments are known, else estimated with its standard error; None with the reason where it
+    overflows."""
     import jax
 
     from perfcontrol._checks import InputError
@@ -80,6 +93,11 @@ def cost_of(problem: Any, M: Any, seed: int, samples: int = 4096) -> dict[str, f
 
     try:
         return {"cost": float(expected_cost(problem, M)), "standard_error": None}
+    except OverflowError as error:
+        return {"cost": None, "standard_error": None, "why": str(error)}
     except InputError:
         estimate = estimate_cost(problem, M, key=jax.random.fold_in(jax.random.key(seed), 1), samples=samples)
-        return {"cost": float(estimate.mean), "standard_error": float(estimate.standard_error)}
+        cost, error = float(estimate.mean), float(estimate.standard_error)
+        if not (math.isfinite(cost) and math.isfinite(error)):
+            return {"cost": None, "standard_error": None, "why": "it overflows at this policy"}
+        return {"cost": cost, "standard_error": error}

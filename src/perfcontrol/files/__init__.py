@@ -6,8 +6,9 @@ from typing import Any
 
 from perfcontrol._checks import fail
 from perfcontrol.files.building import Plan, read_plan
-from perfcontrol.files.run import Run, read_run, write_run
+from perfcontrol.files.run import Run, read_record, read_run, write_run
 from perfcontrol.files.solutions import read_solution, write_solution
+from perfcontrol.files.sweep import read_sweep
 from perfcontrol.files.writing import write_plan
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.solvers import Solution
@@ -16,7 +17,7 @@ __all__ = ["Run", "load", "save"]
 
 
 def load(path: Any) -> Any:
-    """What a file or folder holds: a problem (TOML), a solution (npz), or a run (its folder).
+    """What a file or folder holds: a problem (TOML), a solution (npz), a run or a sweep (its folder).
 
     Nothing in it is executed. Numbers come back bit for bit, in the precision that JAX is set to.
 
@@ -24,7 +25,8 @@ def load(path: Any) -> Any:
         path: of the file or folder.
 
     Returns:
-        A `PerformativeProblem`, a `Solution` or a `Run`.
+        A `PerformativeProblem`, a `Solution`, a `Run`, or of a sweep the xarray Dataset over its grid, NaN where points
+        are not finished.
 
     Raises:
         InputError: no such file, or content that does not fit, with file, line, key and remedy.
@@ -32,7 +34,8 @@ def load(path: Any) -> Any:
     """
     path = _path(path)
     if path.is_dir():
-        return read_run(path)
+        record = read_record(path)
+        return read_sweep(path, record) if record["kind"] == "sweep" else read_run(path)
     if path.suffix == ".toml":
         return read_plan(path).problem
     if path.suffix == ".npz":

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from perfcontrol._checks import InputError
+from perfcontrol._checks import InputError, fail
 from perfcontrol.files.document import Place, read_text
 
 LARGEST = 256 * 2**20  # bytes of a file beside
@@ -58,17 +58,21 @@ def _check(value: list[Any], place: Place) -> tuple[int, ...]:
         else:
             raise (place / i).fault(kind_of(item), "be a number", "An array holds numbers only.")
         if shapes[i] != shapes[0]:
-            lengths = f"{shapes[i] or 'a number'} after {shapes[0] or 'a number'}"
-            raise (place / i).fault(f"shape {lengths}", "be as long as the rows before it", "Complete the row.")
+            got, before = (f"shape {shape}" if shape else "a number" for shape in (shapes[i], shapes[0]))
+            raise (place / i).fault(f"{got} after {before}", "be as long as the rows before it", "Complete the row.")
     return (len(value), *(shapes[0] if shapes else ()))
 
 
 def _beside(name: str, place: Place) -> np.ndarray:
     path = beside(name, place)
     try:
-        return _npy(path, place) if path.suffix == ".npy" else _csv(path)
+        array = read_npy(path) if path.suffix.lower() == ".npy" else _csv(path)
     except InputError as error:
-        raise place.wrong(f"`{name}`: {error}") from None
+        raise place.wrong(f"{path.name}: {error}") from None
+    if np.isnan(array).any():
+        at = np.argwhere(np.isnan(array))[0].tolist()
+        raise place.fault(f"nan at {at} of {path.name!r}", "hold numbers only", "Replace what is missing.")
+    return array
 
 
 def beside(name: str, place: Place) -> Path:
@@ -89,19 +93,22 @@ def beside(name: str, place: Place) -> Path:
     return path
 
 
-def _npy(path: Path, place: Place) -> np.ndarray:
+def read_npy(path: Path) -> np.ndarray:
     """The array of an NPY file; its length is compared with what its header promises before anything is read."""
+    remedy = "Write it with numpy.save(name, array)."
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
+    except FileNotFoundError:
+        raise fail("path", f"{path}, which does not exist", "be a file", "Check the path.") from None
     except (OSError, ValueError, EOFError, SyntaxError, MemoryError, OverflowError, TypeError) as error:
         why = str(error).split("\n")[0][:120]
-        remedy = "Write it with numpy.save(name, array)."
-        raise place.fault(f"{path.name!r} ({why})", "name a NumPy file of numbers", remedy) from None
-    if array.dtype.kind not in "fiub":
-        raise place.fault(f"{path.name!r} of {array.dtype}", "name a NumPy file of real numbers", "Convert it.")
+        raise fail("path", f"{path.name} ({why})", "be a NumPy file of numbers", remedy) from None
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiub":
+        got = f"{path.name} of {getattr(array, 'dtype', 'several arrays')}"
+        raise fail("path", got, "be a NumPy file of real numbers", remedy)
     if array.nbytes > LARGEST:
-        got = f"{path.name!r} of {array.nbytes / 2**20:.0f} MiB"
-        raise place.fault(got, f"name a file of at most {LARGEST / 2**20:g} MiB", "Build the problem in Python.")
+        got = f"{path.name} of {array.nbytes / 2**20:.0f} MiB"
+        raise fail("path", got, f"be a file of at most {LARGEST / 2**20:g} MiB", "Build the problem in Python.")
     return np.array(array)
 
 

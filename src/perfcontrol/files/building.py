@@ -8,10 +8,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import jax
+
 from perfcontrol._checks import InputError
 from perfcontrol.files.arrays import array_of, kind_of
-from perfcontrol.files.document import Document, Place, parsed, read_document
-from perfcontrol.files.registry import IN_PYTHON_ONLY, ROWS, Argument, Row, rows_giving
+from perfcontrol.files.changing import value_of
+from perfcontrol.files.document import Document, Place, read_document, spelt
+from perfcontrol.files.registry import (
+    IN_PYTHON_ONLY,
+    ROWS,
+    Argument,
+    Row,
+    parts_of,
+    plain_type,
+    rows_giving,
+)
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.solvers import AbstractSolver
 from perfcontrol.solvers.solve import check_feasible
@@ -57,10 +68,10 @@ def plan_of(document: Document) -> Plan:
     problem_row = ROWS["PerformativeProblem"]
     if "experiment" in tables:
         experiments = [row for row in rows_giving(PerformativeProblem) if row is not problem_row]
-        _check_keys(tables, PLAN, place, "A file with an experiment")
+        _check_keys(tables, PLAN, place, "a file with an experiment")
         problem = _part(tables["experiment"], experiments, place / "experiment")
     else:
-        _check_keys(tables, {**problem_row.arguments, **PLAN}, place, "A problem")
+        _check_keys(tables, {**problem_row.arguments, **PLAN}, place, "a problem")
         given = {name: value for name, value in tables.items() if name not in PLAN}
         problem = _built(problem_row, given, place)
     read = {name: _value(tables[name], argument, place / name) for name, argument in PLAN.items() if name in tables}
@@ -72,19 +83,22 @@ def plan_of(document: Document) -> Plan:
         with _Located(place, {"M0"}):
             M0 = problem.check_policy("M0", M0)
             check_feasible("M0", problem, M0)
-    return Plan(problem, read.get("solver"), M0, seed)
+    solver = read.get("solver")
+    if solver is not None:
+        with _Located(place / "solver", set(ROWS[type(solver).__name__].arguments)):
+            solver.on(problem, jax.random.key(seed)).check(problem)
+    return Plan(problem, solver, M0, seed)
 
 
-def part_from(text: str, kind: type, name: str) -> Any:
-    """An ingredient from what stands behind an equals sign, as given on a command line."""
-    document = Document(Path(f"--{name}"), text, parsed(f"{name} = {text}", f"--{name}"))
-    return _part(document.tables[name], rows_giving(kind), Place(document, (name,)))
+def part_from(text: str, kind: type, option: str) -> Any:
+    """An ingredient from a name or an inline table, as an option of a command line gives it."""
+    document = Document(Path(option), "", {option: value_of(text)})
+    return _part(document.tables[option], rows_giving(kind), Place(document, (option,)))
 
 
 def _value(value: Any, argument: Argument, place: Place) -> Any:
     """What a key holds, as its argument takes it."""
-    kinds = argument.alternatives
-    parts = [row for kind in kinds if isinstance(kind, type) and kind not in SCALARS for row in rows_giving(kind)]
+    kinds, parts = argument.alternatives, parts_of(argument)
     if parts and (isinstance(value, dict) or (isinstance(value, str) and not _is_file(value, kinds))):
         named = [name for kind in kinds if typing.get_origin(kind) is Literal for name in typing.get_args(kind)]
         if value not in named:
@@ -102,8 +116,9 @@ def _value(value: Any, argument: Argument, place: Place) -> Any:
             names = typing.get_args(kind)
             if value in names and not isinstance(value, bool):
                 return value
-            raise place.fault(kind_of(value), f"be one of {_listed(names)}", _suggest(value, names, ""))
-    required = " or ".join([*(SCALARS[kind] for kind in kinds if kind in SCALARS), *(["a table"] if parts else [])])
+            raise place.fault(kind_of(value), f"be one of {_listed(names)}", _suggest(value, names, "Choose one."))
+    scalars = [kind for kind in kinds if kind in SCALARS and not (kind is int and float in kinds)]
+    required = " or ".join([*(SCALARS[kind] for kind in scalars), *(["a table"] if parts else [])])
     raise place.fault(kind_of(value), f"be {required or 'a list'}", _example(argument))
 
 
@@ -134,7 +149,7 @@ def _part(value: Any, rows: list[Row], place: Place, named: list[str] | None = N
     names = [row.name for row in rows]
     if not isinstance(table, dict):
         raise place.fault(kind_of(value), "be a table with a type", f"Write {{ type = {names[0]!r}, ... }}.")
-    name = table.get("type", _only(rows))
+    name = table.get("type", plain_type(rows))
     where = place if isinstance(value, str) else place / "type"
     if name is None:
         raise place.fault("no type", "have a type", f"Types here: {_listed(names)}.")
@@ -142,16 +157,8 @@ def _part(value: Any, rows: list[Row], place: Place, named: list[str] | None = N
         if isinstance(name, str) and (reason := IN_PYTHON_ONLY.get(name.removeprefix("pc."))):
             raise where.fault(f"pc.{name.removeprefix('pc.')}", "be a type that a file can hold", f"It {reason}.")
         takes = [*(named or []), *names]
-        raise where.fault(
-            kind_of(name), "name what may stand here", _suggest(name, takes, f"That is {_listed(takes)}.")
-        )
+        raise where.fault(kind_of(name), f"be one of {_listed(takes)}", _suggest(name, takes, "Choose one of these."))
     return _built(ROWS[name], {key: item for key, item in table.items() if key != "type"}, place)
-
-
-def _only(rows: list[Row]) -> str | None:
-    """The type that a table has where it says none: one class alone, or the one whose name begins all others."""
-    first = min(rows, key=lambda row: len(row.name))
-    return first.name if all(row.name.startswith(first.name) for row in rows) else None
 
 
 def _built(row: Row, table: dict[str, Any], place: Place) -> Any:
@@ -162,8 +169,9 @@ def _built(row: Row, table: dict[str, Any], place: Place) -> Any:
     given = {name: _value(value, arguments[name], place / name) for name, value in table.items()}
     if missing:
         first, *others = missing
-        more = f" (nor {_listed([argument.name for argument in others])})" if others else ""
-        raise place.wrong(f"{row.name} needs the key `{first.name}`; it is not given{more}. {_example(first)}")
+        more = f", nor {_listed([argument.name for argument in others])}" if others else ""
+        owner = "a problem" if row.gives is PerformativeProblem else row.name
+        raise place.wrong(f"{owner} needs the key `{first.name}`, which is not given{more}. {_example(first)}")
     if row.gives is PerformativeProblem:
         _check_size(given, place)
     with _Located(place, set(arguments)):
@@ -174,15 +182,17 @@ def _check_keys(table: dict[str, Any] | Any, known: Iterable[str], place: Place,
     known = list(known)
     for name in table:
         if name not in known:
-            takes = f"{owner} takes {_listed(known)}." if known else f"{owner} takes no keys beside type."
-            raise (place / name).fault("a key that is not known", f"be a key of {owner}", _suggest(name, known, takes))
+            takes = f"It takes {_listed(known)}." if known else "It takes none beside type."
+            raise (place / name).wrong(
+                f"`{spelt((*place.key, name))}` is no key of {owner}. {_suggest(name, known, takes)}"
+            )
 
 
 def _suggest(name: Any, known: Iterable[str], otherwise: str) -> str:
-    """The nearest of the known names, then what is said in any case."""
+    """The nearest of the known names, or what is said otherwise."""
     folded = {word.casefold(): word for word in known}
     near = difflib.get_close_matches(str(name).casefold().removeprefix("pc."), folded, 1, 0.5)
-    return " ".join([*(f"Did you mean {folded[word]!r}?" for word in near), *([otherwise] if otherwise else [])])
+    return f"Did you mean {folded[near[0]]!r}?" if near else otherwise
 
 
 def _listed(names: Iterable[str]) -> str:
@@ -190,7 +200,11 @@ def _listed(names: Iterable[str]) -> str:
 
 
 def _example(argument: Argument) -> str:
-    return f"{argument.name}: {argument.about}" if argument.about else "Add it."
+    """How to write an argument."""
+    parts = [row.name for row in parts_of(argument)]
+    if parts and Any not in argument.alternatives:
+        return f"Write a table [{argument.name}] with a type, which is one of {_listed(parts)}."
+    return f"{argument.name}: {argument.about}" if argument.about else "Write a value."
 
 
 def _check_size(given: dict[str, Any], place: Place) -> None:
@@ -230,6 +244,8 @@ class _Located:
         for part in self.place.key:
             inside = inside[part]
         found = list(_keys(inside, name, self.place))
+        if not found and name in self.place.document.tables:  # a solver that does not take the problem's cost
+            return Place(self.place.document, (name,))
         return found[0] if len(found) == 1 else None
 
 

@@ -11,15 +11,21 @@ from perfcontrol.files.document import Document, parsed
 
 def changed(document: Document, settings: list[str]) -> Document:
     """The document with keys set, each given as `key=value`; values as in TOML, texts also without quotation marks."""
-    if not settings:
-        return document
-    tables: dict[str, Any] = copy.deepcopy(dict(document.tables))
+    values: dict[str, Any] = {}
     for setting in settings:
         key, equals, text = setting.partition("=")
         if not equals or not key.strip():
             raise fail("--set", repr(setting), "be key=value", "Write for example --set cost.discount=0.9")
-        put(tables, key.strip(), value_of(text.strip()))
-    return replace(document, tables=tables, _lines={})
+        values[key.strip()] = value_of(text.strip())
+    return changed_at(document, values)
+
+
+def changed_at(document: Document, values: dict[str, Any]) -> Document:
+    """The document with dotted keys set."""
+    tables: dict[str, Any] = copy.deepcopy(dict(document.tables))
+    for key, value in values.items():
+        put(tables, key, value)
+    return replace(document, tables=tables)
 
 
 def value_of(text: str) -> Any:

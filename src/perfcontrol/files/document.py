@@ -120,10 +120,6 @@ def parsed(text: str, name: str) -> dict[str, Any]:
         remedy = "A key or table is given twice: remove one." if twice else "See https://toml.io for its rules."
         raise InputError(f"{name}{at}: the file must be valid TOML; got: {what}{column}. {remedy}") from None
     except RecursionError:
-        raise InputError(
-            f"{name}: lists and tables must not be nested so deeply. Write matrices as lists of rows."
-        ) from None
-    except ValueError as error:  # an integer of more than 4300 digits
-        raise InputError(
-            f"{name}: the file must be valid TOML; got: {error}. Use numbers of a reasonable size."
-        ) from None
+        raise InputError(f"{name}: lists or tables are nested too deeply. Write matrices as lists of rows.") from None
+    except ValueError:  # of what is no TOMLDecodeError
+        raise InputError(f"{name}: a whole number has thousands of digits. Use numbers of a reasonable size.") from None

@@ -206,6 +206,18 @@ def rows_giving(kind: type) -> list[Row]:
     return [row for row in ROWS.values() if issubclass(row.gives, kind)]
 
 
+def parts_of(argument: Argument) -> list[Row]:
+    """The rows whose objects an argument takes."""
+    kinds = [kind for kind in argument.alternatives if isinstance(kind, type) and kind not in (bool, int, float, str)]
+    return [row for kind in kinds for row in rows_giving(kind)]
+
+
+def plain_type(rows: list[Row]) -> str | None:
+    """The type of a table that says none: the one class, or the one whose name begins all others."""
+    first = min(rows, key=lambda row: len(row.name))
+    return first.name if all(row.name.startswith(first.name) for row in rows) else None
+
+
 def row_of(part: Any) -> Row | None:
     """The row that an object is written by; None where there is none."""
     if isinstance(part, systems.LinearSystem) and isinstance(part.A, Diagonal) and isinstance(part.B, Diagonal):

@@ -20,7 +20,7 @@ from perfcontrol.files.writing import write_plan
 from perfcontrol.problem import PerformativeProblem, check_problem
 from perfcontrol.solvers import AbstractSolver, Result, Solution
 
-FORMAT = "perfcontrol run 1"
+FORMAT = "perfcontrol capsule 1"  # checkpoints are "perfcontrol run 1"
 PROBLEM, RECORD, SOLUTION = "problem.toml", "run.json", "solution.npz"
 CERTIFICATES, DATASET = "certificates.json", "results.nc"
 
@@ -111,7 +111,12 @@ def write_run(run: Run, folder: Path) -> None:
 def begin(folder: Path, plan: Plan, **settings: Any) -> None:
     """What a run begins with: the problem, and the record of what is to be done."""
     write_plan(plan, folder / PROBLEM)
-    write_record(folder, {"format": FORMAT, "kind": "solve", "ended": None, "began": now(), **settings})
+    begin_record(folder, "solve", **settings)
+
+
+def begin_record(folder: Path, kind: str, **settings: Any) -> None:
+    """The record of what is to be done in a folder."""
+    write_record(folder, {"format": FORMAT, "kind": kind, "ended": None, "began": now(), **settings})
 
 
 def end(folder: Path, run: Run) -> None:

@@ -1,8 +1,5 @@
 """Solutions on disk: arrays as NumPy's npz, the rest as JSON inside of it, nothing executable."""
 
-import json
-import zipfile
-import zlib
 from pathlib import Path
 from typing import Any
 
@@ -10,30 +7,26 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from perfcontrol._array_files import UnreadableError, read_arrays, write_arrays
 from perfcontrol._checks import fail, is_concrete
-from perfcontrol._files import written_whole
-from perfcontrol.solvers import Result, Solution
+from perfcontrol.solvers import Solution
+from perfcontrol.solvers.result import MEMBERS
 
 FORMAT = "perfcontrol solution 1"
-HEADER = "header.json"
-LARGEST = 4 * 2**30  # bytes of all arrays of a file
-NAMES = ("success", "running", "diverged", "nonfinite", "undersampled", "not_converged")  # of `Result`
 
 
 def write_solution(solution: Solution, path: Path) -> None:
     """Write a solution, bit for bit."""
     arrays: dict[str, np.ndarray] = {"M": _array("M", solution.M), "steps": _array("steps", solution.steps)}
     arrays |= {f"stats.{name}": _array(name, value) for name, value in solution.stats.items()}
-    codes = np.stack([np.asarray(solution.result == getattr(Result, name)) for name in NAMES]).argmax(axis=0)
+    codes = np.stack([np.asarray(solution.result == member) for member in MEMBERS.values()]).argmax(axis=0)
     header = {
         "format": FORMAT,
-        "results": NAMES,
+        "results": list(MEMBERS),
         "history": _structure(solution.history, "history", arrays),
         "stats": list(solution.stats),
     }
-    text = json.dumps(header, allow_nan=False).encode()
-    with written_whole(path) as temporary, temporary.open("wb") as file:
-        np.savez(file, allow_pickle=False, **{HEADER: np.frombuffer(text, np.uint8), "result": codes, **arrays})
+    write_arrays(path, header, {"result": codes, **arrays})
 
 
 def _structure(value: Any, name: str, arrays: dict[str, np.ndarray]) -> Any:
@@ -64,17 +57,18 @@ def _array(name: str, value: Any) -> np.ndarray:
 
 def read_solution(path: Path) -> Solution:
     """The solution that a file holds; raises InputError for any other content."""
-    header, arrays = _read(path)
     try:
-        code = arrays.pop("result")
-        names = [header["results"][i] for i in np.atleast_1d(code).tolist()]
-        results = [getattr(Result, name) for name in names if name in NAMES]
+        header, arrays = read_arrays(path, FORMAT)
+        code = arrays["result"]
+        results = [MEMBERS[header["results"][i]] for i in np.atleast_1d(code).tolist()]
         result = results[0] if code.ndim == 0 else jax.tree.map(lambda *each: jnp.stack(each), *results)
-        history = _restored(header["history"], arrays)
         stats = {name: _leaf(arrays[f"stats.{name}"]) for name in header["stats"]}
+        history = _restored(header["history"], arrays)
         return Solution(_leaf(arrays["M"]), result, _leaf(arrays["steps"]), history, stats)
-    except (KeyError, IndexError, TypeError, ValueError, AttributeError, RecursionError) as error:
-        raise unreadable(path, error) from None
+    except FileNotFoundError:
+        raise fail("path", f"{path}, which does not exist", "be a file", "Check the path.") from None
+    except (UnreadableError, KeyError, IndexError, TypeError, ValueError, AttributeError, RecursionError) as error:
+        raise fail("path", f"{path} with {error}"[:300], "be a solution that pc.save wrote", "Save it again.") from None
 
 
 def _restored(structure: Any, arrays: dict[str, np.ndarray]) -> Any:
@@ -92,30 +86,3 @@ def _leaf(array: np.ndarray) -> Any:
     """A JAX array where JAX can hold its numbers as they are, else the NumPy array."""
     double = array.dtype.itemsize == 8 and not jax.config.jax_enable_x64  # type: ignore[attr-defined]
     return array if double else jnp.asarray(array)
-
-
-def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            size = sum(entry.file_size for entry in file.zip.infolist())
-            if size > LARGEST:
-                raise ValueError(f"arrays of {size / 2**30:.1f} GiB")
-            arrays = {name: file[name] for name in file.files}
-        header = json.loads(arrays.pop(HEADER).tobytes().decode())
-        if header["format"] != FORMAT:
-            raise KeyError(header["format"])
-        return header, arrays
-    except FileNotFoundError:
-        raise fail("path", f"{path}, which does not exist", "be a file", "Check the path.") from None
-    except (
-        ValueError, KeyError, TypeError, AttributeError, EOFError, SyntaxError, MemoryError, OverflowError,
-        NotImplementedError, RuntimeError, RecursionError, zipfile.BadZipFile, zlib.error,
-    ) as error:  # fmt: skip
-        raise unreadable(path, error) from None
-
-
-def unreadable(path: Path, error: Exception) -> Exception:
-    """The error about a file with other content."""
-    return fail(
-        "path", f"{path} ({type(error).__name__}: {error})"[:300], "be a file that pc.save wrote", "Save it again."
-    )

@@ -135,7 +135,7 @@ def _lines(table: Mapping[str, Any], key: tuple[str, ...], stem: str, beside: di
 
 
 def _is_tables(value: Any) -> bool:
-    return isinstance(value, list) and bool(value) and isinstance(value[0], Mapping)
+    return isinstance(value, list) and bool(value) and all(isinstance(item, Mapping) for item in value)
 
 
 def _literal(value: Any, key: tuple[str, ...], stem: str, beside: dict[str, np.ndarray]) -> str:
@@ -146,6 +146,8 @@ def _literal(value: Any, key: tuple[str, ...], stem: str, beside: dict[str, np.n
             beside[name] = value
             return json.dumps(name)
         return _rows(value.tolist(), "")
+    if isinstance(value, Mapping):
+        return f"{{ {', '.join(f'{name} = {_literal(item, key, stem, beside)}' for name, item in value.items())} }}"
     if isinstance(value, list):
         return f"[{', '.join(_literal(item, key, stem, beside) for item in value)}]"
     if isinstance(value, str):
