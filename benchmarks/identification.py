@@ -26,8 +26,9 @@ def parts(share: float) -> dict[str, Callable[[], list[str]]]:
 
     def coverage() -> list[str]:
         lines = ["| plant | block | parameters | covered | lowest | highest | outside 92-98 % |", "|" + " --- |" * 7]
-        for seed, n, kind, given in ((0, 2, "norm", True), (0, 2, "norm", False), (4, 3, "matrix and affine", True)):
-            lines += estimates.coverage(plant(seed, n, kind), count(500), 40, given)
+        for seed, n, kind in ((0, 2, "norm"), (4, 3, "matrix and affine")):
+            for given in (True, False):
+                lines += estimates.coverage(plant(seed, n, kind), count(500), 40, given)
         return lines
 
     def deciding() -> list[str]:

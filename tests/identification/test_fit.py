@@ -6,8 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import stats
 
 import perfcontrol as pc
+from perfcontrol.identification.parameter import parameter
 from tests.identification.worlds import small_policies, small_world
 from tests.tools import assert_close, assert_refused, central_differences
 
@@ -78,20 +80,41 @@ def test_fit_of_the_covariance_maximises_the_gaussian_likelihood(reaction: str) 
     assert np.abs(gradient).max() < 1e-2 < 1e-2 * np.abs(elsewhere).max()
 
 
-def test_standard_errors_match_the_sandwich_summed_by_episode() -> None:
+def test_standard_errors_match_estimates_with_each_episode_left_out() -> None:
     fit = fitted()
     x, u, y, episode, _ = rows(LOGS)
     V = conditional_covariances(np.asarray(fit.noise_covariance.mean), np.asarray(fit.scale.mean)[0], LOGS)
+    roots = np.linalg.cholesky(V)
     design = np.stack([np.kron(np.eye(2), np.concatenate([*z, [1.0]])) for z in zip(x, u, strict=True)])  # (N, 2, 8)
-    beta = np.concatenate([np.asarray(e.mean).reshape(2, -1) for e in (fit.A, fit.B, fit.noise_mean)], axis=1).ravel()
-    residual = y - design @ beta
-    bread = np.linalg.inv(sum(X.T @ np.linalg.solve(v, X) for X, v in zip(design, V, strict=True)))
-    scores = np.stack([X.T @ np.linalg.solve(v, r) for X, v, r in zip(design, V, residual, strict=True)])
-    by_episode = np.stack([scores[episode == e].sum(axis=0) for e in range(len(LOGS))])
-    covariance = bread @ by_episode.T @ by_episode @ bread * len(LOGS) / (len(LOGS) - 1)
-    errors = np.sqrt(np.diag(covariance)).reshape(2, 4)
+    design, target = np.linalg.solve(roots, design), np.linalg.solve(roots, y[..., None])[..., 0]
+    without = [
+        np.linalg.lstsq(design[episode != e].reshape(-1, 8), target[episode != e].ravel())[0] for e in range(len(LOGS))
+    ]
+    count, spread = len(LOGS), np.std(without, axis=0).reshape(2, 4)
+    errors = spread * np.sqrt(count - 1)
     assert_close(fit.A.standard_error, errors[:, :2], 1e-5)
     assert_close(fit.B.standard_error, errors[:, 2:3], 1e-5)
+
+
+def test_degrees_of_freedom_are_those_of_a_sample_of_gaussians_and_fewer_for_heavy_tails() -> None:
+    r = np.random.default_rng(0)
+    gaussian, heavy = r.standard_normal((5000, 4)), r.standard_t(5, (5000, 4))
+    few, many = parameter(np.zeros(4), heavy), parameter(np.zeros(4), gaussian)
+    assert np.all(np.abs(np.asarray(many.degrees_of_freedom) / 5000 - 1) < 0.15)
+    assert np.all(np.asarray(few.degrees_of_freedom) < 0.6 * np.asarray(many.degrees_of_freedom))
+    for found, data in ((few, heavy), (many, gaussian)):
+        assert_close(found.standard_error, np.sqrt(np.sum(data**2, axis=0) * 4999 / 5000), 1e-9)
+
+
+@pytest.mark.parametrize("level", [0.5, 0.95])
+def test_intervals_are_those_of_the_t_law(level: float) -> None:
+    influence = np.random.default_rng(1).standard_normal((12, 3))
+    found = parameter(np.arange(3.0), influence - influence.mean(axis=0))
+    low, high = found.interval(level)
+    degrees = np.asarray(found.degrees_of_freedom)
+    expected = stats.t.interval(level, degrees, loc=np.arange(3.0), scale=np.asarray(found.standard_error))
+    assert_close(low, expected[0], 1e-9)
+    assert_close(high, expected[1], 1e-9)
 
 
 def test_fit_recovers_the_world_within_five_standard_errors() -> None:
@@ -218,7 +241,7 @@ def test_fitted_problem_costs_what_a_problem_of_the_same_numbers_costs() -> None
 def test_a_constant_scale_that_came_out_negative_makes_the_same_problem() -> None:
     fit = fitted()
     block = fit.estimated.spread.block
-    flipped = block._replace(values=np.where(np.arange(len(block.values)) == 3, -block.values, block.values))
+    flipped = replace(block, values=np.where(np.arange(len(block.values)) == 3, -block.values, block.values))
     spread = fit.estimated.spread._replace(block=flipped)
     other = replace(fit, estimated=fit.estimated._replace(spread=spread))
     costs = [float(pc.expected_cost(f.problem(cost=COST, horizon=9), small_policies()[1])) for f in (fit, other)]
@@ -248,7 +271,9 @@ def test_fit_reads_as_a_paragraph_and_a_table() -> None:
     for name in ("A", "B", "noise_mean", "noise_covariance", "mean_reaction", "scale", "deployed_scale"):
         values = dataset[name]
         width = values.sel(value="high") - values.sel(value="low")
-        np.testing.assert_allclose(width, 2 * 1.959964 * values.sel(value="standard_error"), rtol=1e-6)
+        low, high = getattr(fit, name).interval()
+        np.testing.assert_allclose(width, high - low, rtol=1e-6)
+        assert np.all(width >= 2 * 1.9599 * values.sel(value="standard_error"))
 
 
 WRONG = {

@@ -72,7 +72,8 @@ def moments(
     for _ in range(ROUNDS):
         whiten = here.whiten()
         here = here._replace(location=reweighted(data, here.location, whiten))
-        sums = covariance_sums(data, here.residual(data), whiten, images).by_group(data.group, len(scale_features))
+        sums = covariance_sums(data, here.residual(data), whiten, images, data.group)
+        sums = sums.score_by_group(data.group, len(scale_features))
         noise, scales = scale_fit(sums, n, scale_features, variances(sums, n))
         noise = _damped(noise, here.noise)
         V = covariances(data, noise, (scale_features @ scales.T) ** 2, images)
@@ -109,8 +110,8 @@ def _hidden(data: Transitions, here: Moments, spread: Joint, features: np.ndarra
     s = len(upper(spread.noise))
     if free:
         return np.zeros((s + k * width, 0))
-    sums = covariance_sums(data, here.residual(data), here.whiten(), images_of(data, spread.directions))
-    information = sums.by_group(data.group, len(features)).information
+    images = images_of(data, spread.directions)
+    information = covariance_sums(data, here.residual(data), here.whiten(), images, data.group).information
     eta = np.abs(features @ spread.scales.T)
     eta = np.maximum(eta, 0.1 * max(float(eta.max(initial=0.0)), 1e-3 * np.sqrt(float(np.trace(spread.noise)))))
     jacobian = np.zeros((len(features), s + k, s + k * width))

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import linalg
 
-from perfcontrol.identification.blocks import Block
+from perfcontrol.identification.blocks import Block, pseudo_inverse
 from perfcontrol.identification.covariance import semidefinite
 from perfcontrol.identification.moments import (
     Sums,
@@ -23,9 +23,10 @@ from perfcontrol.identification.moments import (
 )
 from perfcontrol.identification.transitions import Transitions
 
-STEPS = 12
-SETTLED = 1e-6
-HALVINGS = 6
+STEPS = 50
+SETTLED = 1e-6  # of the log-likelihood: what a full step would gain
+STALLED = 1e-4  # what a damped step gained
+LEAST, MOST = 1e-3, 1e6  # damping of a step, in shares of the information
 
 
 class Joint(NamedTuple):
@@ -44,19 +45,22 @@ class Joint(NamedTuple):
         """Noise, scales and directions for other values of the block's coordinates."""
         return _unpacked(values, self.noise, self.scales, self.directions, self.tangent)
 
-    def scale_covariance(self) -> np.ndarray:
-        """Of the scales, (k, Q, k, Q)."""
-        first = len(self.noise) * (len(self.noise) + 1) // 2
-        part = slice(first, first + self.scales.size)
-        return self.block.covariance()[part, part].reshape(2 * self.scales.shape)
+    def noise_influence(self) -> np.ndarray:
+        """Of every unit on the noise's upper triangle, as `Block.influence`, (U, n(n+1)/2)."""
+        return self.block.influence[:, : len(upper(self.noise))]
 
-    def direction_errors(self) -> np.ndarray:
-        """Standard errors of the directions, (k, n, p)."""
+    def scale_influence(self) -> np.ndarray:
+        """Likewise on the scales, (U, k, Q)."""
+        first = len(upper(self.noise))
+        influence = self.block.influence[:, first : first + self.scales.size]
+        return influence.reshape(len(influence), *self.scales.shape)
+
+    def direction_influence(self) -> np.ndarray:
+        """Likewise on the directions, (U, k, n, p); zero where they have no coordinates."""
         k, _, width = self.tangent.shape
-        first = len(self.block.values) - k * width
-        covariance = self.block.covariance()[first:, first:].reshape(k, width, k, width)
-        variance = np.einsum("kuv,kvkw,kuw->ku", self.tangent, covariance, self.tangent)
-        return np.sqrt(np.maximum(variance, 0)).reshape(self.directions.shape)
+        influence = self.block.influence[:, self.block.influence.shape[1] - k * width :]
+        along = np.einsum("kdv,ukv->ukd", self.tangent, influence.reshape(len(influence), k, width))
+        return along.reshape(len(influence), *self.directions.shape)
 
 
 def joint_scoring(
@@ -68,28 +72,37 @@ def joint_scoring(
 ) -> Joint:
     """From (noise, scales, directions); features (G, Q). Directions that are not `free` have no coordinates."""
     scale = float(np.mean(residual**2))
-    noise, scales, directions = start
-    V, reached = _likelihood(data, residual, features, noise, scales, directions, scale)
-    step = 0
-    while True:
-        tangent = _tangents(directions, free)
-        sums = _sums(data, residual, V, features, scales, directions, tangent, scale)
-        block = Block(np.concatenate([upper(noise), scales.ravel(), np.zeros(len(tangent) * tangent.shape[2])]), *sums)
-        here = Joint(noise, scales, directions, tangent, block)
-        score = sums.score.sum(axis=0)
-        move = block.bread() @ score
-        step += 1
-        if step > STEPS or score @ move < SETTLED:
-            return here
-        for _ in range(HALVINGS):
-            trial = here.at(block.values + move)
+    here, damping, gained = start, 0.0, np.inf
+    V, reached = _likelihood(data, residual, features, *here, scale)
+    for _ in range(STEPS):
+        tangent, values = _coordinates(*here, free)
+        sums = _sums(data, residual, V, features, *here[1:], tangent, scale, data.group)
+        score, information = sums.score.sum(axis=0), sums.information.sum(axis=0)
+        stalled = damping > 0 and gained < STALLED  # as where the noise is singular, and its score does not vanish
+        if stalled or score @ pseudo_inverse(information) @ score < SETTLED:
+            break
+        while damping < MOST:
+            move = pseudo_inverse(information + damping * np.diag(np.diag(information))) @ score
+            trial = _unpacked(values + move, *here, tangent)
             V_trial, value = _likelihood(data, residual, features, *trial, scale)
             if value > reached:
                 break
-            move = move / 2
+            damping = max(10 * damping, LEAST)
         else:
-            return here
-        (noise, scales, directions), V, reached = trial, V_trial, value
+            break
+        damping = damping / 10 if damping > LEAST else 0.0
+        here, V, reached, gained = trial, V_trial, value, value - reached
+    tangent, values = _coordinates(*here, free)
+    units = np.arange(len(data.group))
+    return Joint(*here, tangent, Block(values, *_sums(data, residual, V, features, *here[1:], tangent, scale, units)))
+
+
+def _coordinates(
+    noise: np.ndarray, scales: np.ndarray, directions: np.ndarray, free: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """Tangents, and the values of a block's coordinates."""
+    tangent = _tangents(directions, free)
+    return tangent, np.concatenate([upper(noise), scales.ravel(), np.zeros(len(tangent) * tangent.shape[2])])
 
 
 def _tangents(directions: np.ndarray, free: bool) -> np.ndarray:
@@ -139,24 +152,31 @@ def _sums(
     directions: np.ndarray,
     tangent: np.ndarray,
     scale: float,
+    bins: np.ndarray,
 ) -> Sums:
-    n, p = directions.shape[1:]
+    """Of noise, scales and tangents; information by bins of units. ∂V/∂D_k,ip: a multiple of sym(e_i (D_k z)ᵀ) z_p."""
+    (n, p), free = directions.shape[1:], tangent.shape[-1] > 0
     basis, images, eta = symmetric_basis(n), images_of(data, directions), features @ scales.T
-    z = data.moved(p)
-    whiten, group = inverse_factors(V, scale), data.row_group
-    axes = tangent.reshape(len(directions), n, p, tangent.shape[-1])
+    z, whiten, group = data.moved(p), inverse_factors(V, scale), data.row_group
 
     def design(rows: slice) -> tuple[np.ndarray, np.ndarray]:
         L, g = whiten[rows], group[rows]
         noise = np.einsum("tia,pab,tjb->tpij", L, basis, L, optimize=True)
         a = np.einsum("tij,tkj->tki", L, images[rows])
         outer = isometric(a[..., :, None] * a[..., None, :])  # (t, k, s)
-        by_scale = 2 * np.einsum("tk,tq,tks->tkqs", eta[g], features[g], outer).reshape(len(g), -1, outer.shape[-1])
-        d = np.einsum("tij,kjpv,tp->tkvi", L, axes, z[rows], optimize=True) * eta[g][:, :, None, None] ** 2
-        both = d[..., :, None] * a[:, :, None, None, :]
-        by_direction = isometric(both + np.swapaxes(both, -1, -2)).reshape(len(g), -1, outer.shape[-1])
+        by_scale = 2 * (eta[g][:, :, None] * features[g][:, None, :])[..., None] * outer[:, :, None, :]
+        parts = [isometric(noise), by_scale.reshape(len(g), -1, outer.shape[-1])]
+        if free:
+            side = np.swapaxes(L, 1, 2)[:, None, :, :, None] * (a * eta[g][:, :, None] ** 2)[:, :, None, None, :]
+            sides = isometric(side + np.swapaxes(side, -1, -2))  # (t, k, i, s)
+            entries = sides[:, :, :, None, :] * z[rows][:, None, None, :, None]
+            parts.append(entries.reshape(len(g), -1, outer.shape[-1]))
         r = residual[rows]
         target = isometric(L @ (r[:, :, None] * r[:, None, :] - V[rows]) @ np.swapaxes(L, -1, -2))
-        return np.concatenate([isometric(noise), by_scale, by_direction], axis=1), target
+        return np.concatenate(parts, axis=1), target
 
-    return row_sums(data, design)
+    sums = row_sums(data, design, bins)
+    if not free:
+        return sums
+    onto = linalg.block_diag(np.eye(len(basis) + scales.size), *tangent)
+    return Sums(sums.score @ onto, onto.T @ sums.information @ onto)

@@ -87,7 +87,8 @@ def least_squares(data: Transitions, jacobian: np.ndarray) -> Location:
 def reweighted(data: Transitions, location: Location, whiten: np.ndarray) -> Location:
     """Weighted least squares with weights whitenᵀ whiten."""
     n = data.y.shape[1]
-    sums = mean_sums(data, location.residual(data), whiten).by_group(data.group, len(location.jacobian))
+    sums = mean_sums(data, location.residual(data), whiten, data.group)
+    sums = sums.score_by_group(data.group, len(location.jacobian))
     maps = np.stack([np.kron(np.eye(n), J @ location.identified) for J in location.jacobian])
     information = np.einsum("gpi,gpq,gqj->ij", maps, sums.information, maps, optimize=True)
     score = np.einsum("gpi,gp->i", maps, sums.score)

@@ -10,13 +10,14 @@ w_{t-1} but not on w_t: so the scores of different units are uncorrelated, whate
 """
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
 
 from perfcontrol.identification.transitions import Transitions
 
+WIDE = 4000  # transitions worked on at a time, where each has a design of many numbers
 FLOOR = 1e-8  # of the mean squared residual: weights of noise that is singular stay finite
 
 
@@ -27,11 +28,18 @@ class Sums(NamedTuple):
     information: np.ndarray
 
     def by_group(self, group: np.ndarray, count: int) -> "Sums":
-        """Summed over the units of each deployment."""
-        total = Sums(*(np.zeros((count, *part.shape[1:])) for part in self))
-        for into, part in zip(total, self, strict=True):
-            np.add.at(into, group, part)
-        return total
+        """Both summed over the units of each deployment."""
+        return Sums(*(_grouped(part, group, count) for part in self))
+
+    def score_by_group(self, group: np.ndarray, count: int) -> "Sums":
+        """Scores summed over the units of each deployment; information was by deployment from the start."""
+        return self._replace(score=_grouped(self.score, group, count))
+
+
+def _grouped(part: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
+    total = np.zeros((count, *part.shape[1:]))
+    np.add.at(total, group, part)
+    return total
 
 
 def symmetric_basis(n: int) -> np.ndarray:
@@ -61,29 +69,48 @@ def inverse_factors(V: np.ndarray, scale: float) -> np.ndarray:
     return np.linalg.inv(np.linalg.cholesky(V + FLOOR * max(scale, np.finfo(float).tiny) * eye))
 
 
+def _runs(data: Transitions, units: slice, bins: np.ndarray) -> Iterator[tuple[int, slice]]:
+    """Neighbours of one bin (U,) among some units: the bin, and their rows counted from the first of all."""
+    own = bins[units]
+    first = units.start + np.flatnonzero(np.diff(own, prepend=own[0] - 1))
+    start = data.unit[np.append(first, units.stop)] - data.unit[units.start]
+    for bin_, (begin, end) in zip(bins[first], itertools.pairwise(start), strict=True):
+        yield int(bin_), slice(int(begin), int(end))
+
+
+def _unit_sums(data: Transitions, units: slice, values: np.ndarray) -> np.ndarray:
+    """Summed over the rows of each of some units."""
+    return np.add.reduceat(values, data.unit[units] - data.unit[units.start], axis=0)
+
+
 def _kronecker_sums(data: Transitions, parts: Callable[[slice], tuple], bins: np.ndarray) -> Sums:
     """Scores target ⊗ right of every unit; information left ⊗ right rightᵀ summed over bins (U,) of units.
 
     parts: rows -> left (N, a, a) symmetric, target (N, a), right (N, q); coefficients (a, q), flattened row by row.
     """
-    score, compact, pairs_a, pairs_q = [], {}, ([], []), ([], [])
-    for units, rows in data.pieces():
+    score, compact = [], {}
+    for units, rows in data.pieces(WIDE):
         left, target, right = parts(rows)
-        pairs_a, pairs_q = np.triu_indices(target.shape[1]), np.triu_indices(right.shape[1])
-        left, squares = left[:, *pairs_a], right[:, pairs_q[0]] * right[:, pairs_q[1]]
-        start = data.unit[units.start : units.stop + 1] - rows.start
-        for unit, (first, last) in zip(range(units.start, units.stop), itertools.pairwise(start), strict=True):
-            score.append((target[first:last].T @ right[first:last]).ravel())
-            bin_ = int(bins[unit])
-            compact[bin_] = compact.get(bin_, 0.0) + left[first:last].T @ squares[first:last]
-    a, q = pairs_a[1][-1] + 1, pairs_q[1][-1] + 1
-    full = np.zeros((int(bins.max()) + 1, a, a, q, q))
+        score.append(_unit_sums(data, units, target[:, :, None] * right[:, None, :]))
+        left, squares = upper(left), upper(right[:, :, None] * right[:, None, :])
+        for bin_, run in _runs(data, units, bins):
+            compact[bin_] = compact.get(bin_, 0.0) + left[run].T @ squares[run]
+    scores = np.concatenate(score)
+    by_a, by_q = _pair_index(scores.shape[1]), _pair_index(scores.shape[2])
+    packed = np.zeros((int(bins.max()) + 1, int(by_a.max()) + 1, int(by_q.max()) + 1))
     for bin_, sums in compact.items():
-        for i, j, block in zip(*pairs_a, sums, strict=True):
-            full[bin_, i, j][pairs_q] = block
-            full[bin_, i, j].T[pairs_q] = block
-            full[bin_, j, i] = full[bin_, i, j]
-    return Sums(np.array(score), full.transpose(0, 1, 3, 2, 4).reshape(-1, a * q, a * q))
+        packed[bin_] = sums
+    information = packed[:, by_a[:, None, :, None], by_q[None, :, None, :]]
+    return Sums(
+        scores.reshape(len(scores), -1), information.reshape(len(packed), *2 * (by_a.shape[0] * by_q.shape[0],))
+    )
+
+
+def _pair_index(n: int) -> np.ndarray:
+    """Where each entry of a symmetric matrix stands in its upper triangle, (n, n)."""
+    index = np.zeros((n, n), dtype=int)
+    index[np.triu_indices(n)] = np.arange(n * (n + 1) // 2)
+    return np.maximum(index, index.T)
 
 
 def images_of(data: Transitions, directions: np.ndarray) -> np.ndarray:
@@ -127,21 +154,27 @@ def monomials(z: np.ndarray) -> np.ndarray:
     return np.concatenate([np.ones((len(z), 1)), upper(z[:, :, None] * z[:, None, :])], axis=1)
 
 
-def row_sums(data: Transitions, parts: Callable[[slice], tuple[np.ndarray, np.ndarray]], rows: int = 4000) -> Sums:
-    """Of any linear model of whitened squares: rows -> design (N, P, s) and target (N, s), in isometric form."""
-    scores, informations = [], []
-    for units, part in data.pieces(rows):
-        design, target = parts(part)
-        start = data.unit[units.start : units.stop + 1] - part.start
-        scores.append(np.add.reduceat(np.einsum("tps,ts->tp", design, target) / 2, start[:-1], axis=0))
-        for first, last in itertools.pairwise(start):
-            flat = design[first:last].transpose(0, 2, 1).reshape(-1, design.shape[1])
-            informations.append(flat.T @ flat / 2)
-    return Sums(np.concatenate(scores), np.array(informations))
+def row_sums(
+    data: Transitions, parts: Callable[[slice], tuple[np.ndarray, np.ndarray]], bins: np.ndarray | None = None
+) -> Sums:
+    """Of any linear model of whitened squares: rows -> design (N, P, s) and target (N, s), in isometric form;
+    information by unit, or by bins of units."""
+    bins, scores, found = np.arange(len(data.group)) if bins is None else bins, [], {}
+    for units, rows in data.pieces(WIDE):
+        design, target = parts(rows)
+        scores.append(_unit_sums(data, units, np.einsum("tps,ts->tp", design, target) / 2))
+        flat = np.ascontiguousarray(design.transpose(0, 2, 1))
+        for bin_, run in _runs(data, units, bins):
+            part = flat[run].reshape(-1, flat.shape[2])
+            found[bin_] = found.get(bin_, 0.0) + part.T @ part / 2
+    return Sums(np.concatenate(scores), np.array([found[bin_] for bin_ in range(int(bins.max()) + 1)]))
 
 
-def covariance_sums(data: Transitions, residual: np.ndarray, whiten: np.ndarray, images: np.ndarray) -> Sums:
-    """Of the local covariance coefficients (upper triangle of Σ, θ_1, ..., θ_k), at zero; images: D_k z, (N, k, n)."""
+def covariance_sums(
+    data: Transitions, residual: np.ndarray, whiten: np.ndarray, images: np.ndarray, bins: np.ndarray | None = None
+) -> Sums:
+    """Of the local covariance coefficients (upper triangle of Σ, θ_1, ..., θ_k), at zero; images: D_k z, (N, k, n);
+    information by unit, or by bins of units."""
     basis = symmetric_basis(data.y.shape[1])
 
     def parts(rows: slice) -> tuple[np.ndarray, np.ndarray]:
@@ -152,4 +185,4 @@ def covariance_sums(data: Transitions, residual: np.ndarray, whiten: np.ndarray,
         design = np.concatenate([isometric(noise), isometric(a[..., :, None] * a[..., None, :])], axis=1)
         return design, isometric(w[:, :, None] * w[:, None, :])
 
-    return row_sums(data, parts)
+    return row_sums(data, parts, bins)

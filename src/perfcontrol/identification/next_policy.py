@@ -27,7 +27,7 @@ def next_policy(
     else:
         reach = _radius(data, common, radius)
         tried = last + reach * _unit_steps(data, generator)
-    return tried[int(np.argmax([_gain(data, common, M) for M in tried]))]
+    return tried[int(np.argmax(_gains(data, common, tried)))]
 
 
 def _checked(candidates: Any, shape: tuple[int, ...]) -> np.ndarray:
@@ -62,20 +62,26 @@ def _unit_steps(data: Transitions, generator: np.random.Generator) -> np.ndarray
     return (steps / np.linalg.norm(steps, axis=1, keepdims=True)).reshape(-1, *data.policies.shape[1:])
 
 
-def _gain(data: Transitions, common: Common, M: np.ndarray) -> float:
+def _gains(data: Transitions, common: Common, tried: np.ndarray) -> np.ndarray:
+    """What each of some policies (k, memory, m, n) adds, (k,)."""
     counts = np.bincount(data.row_group, minlength=len(data.policies))
     each = counts.mean()
-    scale = max(max(float(np.linalg.norm(policy)) for policy in data.policies), float(np.linalg.norm(M)), 1e-300)
-    features = np.stack([_features(policy / scale) for policy in data.policies])
-    f = _features(M / scale)
-    known = features.T @ (counts[:, None] * features) + PRIOR * each * np.eye(len(f))
-    through = M @ common.root
-    moved = np.einsum("imn,ikn->mk", through, through)
-    size = max(float(np.trace(moved)), float(np.sum(data.v**2)) / len(data.v), 1e-300)
-    before = data.v.T @ data.v / size + PRIOR * each * np.eye(len(moved))
-    excitation = np.linalg.slogdet(np.eye(len(moved)) + each * np.linalg.solve(before, moved / size))[1]
-    return float(np.log1p(each * f @ np.linalg.solve(known, f)) + excitation)
+    largest = np.sqrt(np.sum(data.policies**2, axis=(1, 2, 3)).max())
+    scale = np.maximum(np.maximum(np.sqrt(np.sum(tried**2, axis=(1, 2, 3))), largest), 1e-300)
+    features = _features(data.policies / scale[:, None, None, None, None])
+    f = _features(tried / scale[:, None, None, None])
+    known = np.swapaxes(features, 1, 2) @ (counts[:, None] * features) + PRIOR * each * np.eye(f.shape[1])
+    reaction = np.log1p(each * np.einsum("kf,kf->k", f, np.linalg.solve(known, f[:, :, None])[..., 0]))
+    through = tried @ common.root
+    moved = np.einsum("kimn,kijn->kmj", through, through)
+    size = np.maximum(np.trace(moved, axis1=1, axis2=2), max(float(np.sum(data.v**2)) / len(data.v), 1e-300))
+    eye, size = np.eye(moved.shape[1]), size[:, None, None]
+    before = data.v.T @ data.v / size + PRIOR * each * eye
+    return reaction + np.linalg.slogdet(eye + each * np.linalg.solve(before, moved / size))[1]
 
 
-def _features(M: np.ndarray) -> np.ndarray:
-    return np.concatenate([[1.0], M.ravel(), [np.linalg.norm(M)]])
+def _features(policies: np.ndarray) -> np.ndarray:
+    """(1, M, ‖M‖) of policies (..., memory, m, n)."""
+    flat = policies.reshape(*policies.shape[:-3], -1)
+    ones, norm = np.ones((*flat.shape[:-1], 1)), np.linalg.norm(flat, axis=-1, keepdims=True)
+    return np.concatenate([ones, flat, norm], axis=-1)

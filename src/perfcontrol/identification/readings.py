@@ -2,12 +2,11 @@
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
-from perfcontrol.evaluate import Estimate
 from perfcontrol.identification.blocks import Block
 from perfcontrol.identification.location import Location, jacobian
+from perfcontrol.identification.parameter import Parameter, parameter
 
 HIDDEN = 1e-6  # share of a functional in what is not identified, beyond which it is not either
 
@@ -40,17 +39,14 @@ class MeanReading(NamedTuple):
             out.append(functional)
         return out
 
-    def estimate(self, functional: np.ndarray) -> Estimate:
+    def estimate(self, functional: np.ndarray) -> Parameter:
         """The value (n, columns) with its standard error, infinite where it is not identified."""
         location = self.location
         n, free = len(location.coefficients), location.identified.shape[1]
-        covariance = self.block.covariance().reshape(n, free, n, free)
-        through = functional @ location.identified
-        variance = np.einsum("ra,iaib,rb->ir", through, covariance, through)
+        influence = self.block.influence.reshape(-1, n, free) @ (functional @ location.identified).T
         size = np.linalg.norm(location.unidentified, axis=0)
         hidden = (np.abs(functional @ location.unidentified) > HIDDEN * size).any(axis=1)
-        errors = np.where(hidden, np.inf, np.sqrt(np.maximum(variance, 0)))
-        return Estimate(jnp.asarray(location.coefficients @ functional.T), jnp.asarray(errors))
+        return parameter(location.coefficients @ functional.T, influence, hidden)
 
     def coefficients(self, free: np.ndarray) -> np.ndarray:
         """The coefficients (n, p) for other values of the block's."""

@@ -4,16 +4,14 @@ from typing import Any
 
 import numpy as np
 
-from perfcontrol.evaluate import Estimate
+from perfcontrol.identification.parameter import Parameter
 
-NORMAL = 1.959963984540054  # 97.5 % point of the normal law
 VALUES = ("estimate", "standard_error", "low", "high")
 
 
-def interval(estimate: Estimate) -> np.ndarray:
+def interval(estimate: Parameter) -> np.ndarray:
     """Estimate, standard error and the ends of the 95 % interval, stacked in front."""
-    mean, error = np.asarray(estimate.mean, dtype=float), np.asarray(estimate.standard_error, dtype=float)
-    return np.stack([mean, error, mean - NORMAL * error, mean + NORMAL * error])
+    return np.stack([np.asarray(estimate.mean), np.asarray(estimate.standard_error), *estimate.interval()])
 
 
 def table(fit: Any) -> Any:
@@ -81,7 +79,7 @@ def paragraph(fit: Any) -> str:
     return " ".join(said)
 
 
-def _accuracy(name: str, estimate: Estimate) -> str:
+def _accuracy(name: str, estimate: Parameter) -> str:
     error = np.asarray(estimate.standard_error)
     if not np.all(np.isfinite(error)):
         return f"{name} is known in part."

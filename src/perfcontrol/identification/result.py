@@ -9,11 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from perfcontrol._checks import check_integer, check_key, fail
-from perfcontrol.evaluate import Estimate
 from perfcontrol.identification.decision import Decision, decide
 from perfcontrol.identification.estimate import Estimated
 from perfcontrol.identification.features import Features
 from perfcontrol.identification.logs import Logs
+from perfcontrol.identification.moments import symmetric_basis
+from perfcontrol.identification.parameter import Parameter, parameter
 from perfcontrol.identification.plant import Coefficients, build, logged_start
 from perfcontrol.identification.readings import HIDDEN, MeanReading
 from perfcontrol.identification.report import paragraph, table
@@ -43,61 +44,57 @@ class Fit:
     estimated: Estimated
 
     @property
-    def A(self) -> Estimate:
+    def A(self) -> Parameter:
         """State matrix, (n, n); the standard error is infinite where the logs do not tell."""
         return self._mean.estimate(self._mean.functionals()["A"])
 
     @property
-    def B(self) -> Estimate:
+    def B(self) -> Parameter:
         """Input matrix, (n, m); the standard error is infinite where the logs do not tell."""
         return self._mean.estimate(self._mean.functionals()["B"])
 
     @property
-    def noise_mean(self) -> Estimate:
+    def noise_mean(self) -> Parameter:
         """E w_t, (n,)."""
-        estimate = self._mean.estimate(self._mean.functionals()["noise_mean"])
-        return Estimate(estimate.mean[:, 0], estimate.standard_error[:, 0])
+        return jax.tree.map(lambda column: column[:, 0], self._mean.estimate(self._mean.functionals()["noise_mean"]))
 
     @property
-    def mean_reaction(self) -> Estimate:
+    def mean_reaction(self) -> Parameter:
         """Coefficients of Θ, (q, n, p): Θ(M) = Σ_j c_j (f_j(M) - f_j(0))."""
         parts = [self._mean.estimate(functional) for functional in self._mean.slopes()]
         if not parts:
             empty = jnp.zeros((0, self.logs.state_size, self._mean.width))
-            return Estimate(empty, empty)
-        return Estimate(jnp.stack([p.mean for p in parts]), jnp.stack([p.standard_error for p in parts]))
+            return Parameter(empty, empty, empty)
+        return jax.tree.map(lambda *leaves: jnp.stack(leaves), *parts)
 
     @property
-    def noise_covariance(self) -> Estimate:
+    def noise_covariance(self) -> Parameter:
         """Cov w_t, (n, n)."""
         spread, n = self.estimated.spread, self.logs.state_size
-        errors = np.zeros((n, n))
         size = n * (n + 1) // 2
-        told = spread.block.standard_errors()[:size]
-        errors[np.triu_indices(n)] = np.where(self._untold(np.eye(size, len(spread.block.values))), np.inf, told)
-        return Estimate(jnp.asarray(spread.noise), jnp.asarray(np.maximum(errors, errors.T)))
+        unknown = self._untold(np.eye(size, len(spread.block.values)))
+        square = np.tensordot(np.arange(size), symmetric_basis(n), axes=1).astype(int)  # the place of each entry
+        return parameter(spread.noise, spread.noise_influence()[:, square], unknown[square])
 
     @property
-    def scale(self) -> Estimate:
+    def scale(self) -> Parameter:
         """Coefficients of the scales, (k, 1+q): scale_k(M) = c_k0 + Σ_j c_kj f_j(M). The sign of a row is arbitrary."""
-        scales = self.estimated.spread.scales
-        variance = np.einsum("kqkq->kq", self.estimated.spread.scale_covariance())
-        untold = self._untold_scales(np.eye(scales.shape[1])).T
-        return Estimate(jnp.asarray(scales), jnp.asarray(np.where(untold, np.inf, np.sqrt(variance))))
+        spread = self.estimated.spread
+        untold = self._untold_scales(np.eye(spread.scales.shape[1])).T
+        return parameter(spread.scales, spread.scale_influence(), untold)
 
     @property
-    def deployed_scale(self) -> Estimate:
+    def deployed_scale(self) -> Parameter:
         """scale(M) at each deployed policy, (G, k)."""
         spread, values = self.estimated.spread, self.scale_features.values(self.data.policies)
-        variance = np.einsum("gq,kqkr,gr->gk", values, spread.scale_covariance(), values)
-        errors = np.where(self._untold_scales(values), np.inf, np.sqrt(np.maximum(variance, 0)))
-        return Estimate(jnp.asarray(values @ spread.scales.T), jnp.asarray(errors))
+        influence = np.einsum("gq,ukq->ugk", values, spread.scale_influence())
+        return parameter(values @ spread.scales.T, influence, self._untold_scales(values))
 
     @property
-    def directions(self) -> Estimate:
+    def directions(self) -> Parameter:
         """D_k, (k, n, p); the standard error is zero where they were given. The sign of each is arbitrary."""
         spread = self.estimated.spread
-        return Estimate(jnp.asarray(spread.directions), jnp.asarray(spread.direction_errors()))
+        return parameter(spread.directions, spread.direction_influence())
 
     @property
     def unidentified(self) -> tuple[str, ...]:
