@@ -11,6 +11,7 @@ from benchmarks.plants import Plant, plant
 
 EPISODES, HORIZON = 40, 10
 FLIPS = 199
+PILOTS = 30
 LEVEL = 0.05
 
 
@@ -68,8 +69,8 @@ def power(sets: int, states: tuple[int, ...]) -> list[str]:
                 return [(_in_errors(test, part), test.p_value) for test in tests]
 
             size = 0.3
-            for pilot in range(3):  # until the mean estimate is five of its standard errors
-                seen = run(size, range(1000 + 30 * pilot, 1030 + 30 * pilot))
+            for _ in range(6):  # until the mean estimate is five of its standard errors, which grow with it
+                seen = run(size, range(1000, 1000 + PILOTS))
                 size *= 5 / float(np.mean([shift for shift, _ in seen]))
             found = run(size, range(sets))
             hits = [p <= LEVEL for _, p in found]

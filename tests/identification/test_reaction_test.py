@@ -7,7 +7,7 @@ import pytest
 import perfcontrol as pc
 from perfcontrol.identification.deviations import centred, estimated_deviations, score_deviations
 from perfcontrol.identification.moments import Sums
-from perfcontrol.identification.randomisation import combined, p_values, quadratic_statistics
+from perfcontrol.identification.randomisation import combined, p_values, statistics_of
 from tests.identification.worlds import small_policies, small_world
 from tests.tools import assert_close, assert_refused
 
@@ -67,15 +67,17 @@ def test_statistics_match_a_loop_over_flips_deployments_and_coefficients() -> No
     group = np.repeat([0, 1], [4, 6])
     contributions, signs = r.standard_normal((10, 2, 3)), r.choice([-1.0, 1.0], (5, 10))
     about = centred(contributions, group).reshape(contributions.shape)
-    expected = np.zeros((6, 3))
+    T = np.zeros((6, 2, 3))
     for row in range(6):
         for j in range(3):
             for g in range(2):
                 a = contributions[:, g, j] if row == 0 else signs[row - 1] * about[:, g, j]
                 parts = [a[group == h] for h in (0, 1)]
                 variance = sum(len(part) * part.var(ddof=1) for part in parts)
-                expected[row, j] += a.sum() ** 2 / variance
-    assert_close(quadratic_statistics(contributions, group, signs), expected, 1e-10)
+                T[row, g, j] = a.sum() ** 2 / variance
+    found = statistics_of(contributions, group, signs)
+    assert_close(found.largest, T.max(axis=1), 1e-10)
+    assert_close(found.total, T.sum(axis=1), 1e-10)
 
 
 def test_p_values_count_the_rows_that_are_at_least_as_large() -> None:

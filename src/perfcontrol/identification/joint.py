@@ -72,18 +72,18 @@ def joint_scoring(
 ) -> Joint:
     """From (noise, scales, directions); features (G, Q). Directions that are not `free` have no coordinates."""
     scale = float(np.mean(residual**2))
-    here, damping, gained = start, 0.0, np.inf
-    V, reached = _likelihood(data, residual, features, *here, scale)
+    (noise, scales, directions), damping, gained = start, 0.0, np.inf
+    V, reached = _likelihood(data, residual, features, noise, scales, directions, scale)
     for _ in range(STEPS):
-        tangent, values = _coordinates(*here, free)
-        sums = _sums(data, residual, V, features, *here[1:], tangent, scale, data.group)
+        tangent, values = _coordinates(noise, scales, directions, free)
+        sums = _sums(data, residual, V, features, scales, directions, tangent, scale, data.group)
         score, information = sums.score.sum(axis=0), sums.information.sum(axis=0)
         stalled = damping > 0 and gained < STALLED  # as where the noise is singular, and its score does not vanish
         if stalled or score @ pseudo_inverse(information) @ score < SETTLED:
             break
         while damping < MOST:
             move = pseudo_inverse(information + damping * np.diag(np.diag(information))) @ score
-            trial = _unpacked(values + move, *here, tangent)
+            trial = _unpacked(values + move, noise, scales, directions, tangent)
             V_trial, value = _likelihood(data, residual, features, *trial, scale)
             if value > reached:
                 break
@@ -91,10 +91,11 @@ def joint_scoring(
         else:
             break
         damping = damping / 10 if damping > LEAST else 0.0
-        here, V, reached, gained = trial, V_trial, value, value - reached
-    tangent, values = _coordinates(*here, free)
+        (noise, scales, directions), V, reached, gained = trial, V_trial, value, value - reached
+    tangent, values = _coordinates(noise, scales, directions, free)
     units = np.arange(len(data.group))
-    return Joint(*here, tangent, Block(values, *_sums(data, residual, V, features, *here[1:], tangent, scale, units)))
+    sums = _sums(data, residual, V, features, scales, directions, tangent, scale, units)
+    return Joint(noise, scales, directions, tangent, Block(values, *sums))
 
 
 def _coordinates(

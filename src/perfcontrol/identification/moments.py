@@ -101,9 +101,8 @@ def _kronecker_sums(data: Transitions, parts: Callable[[slice], tuple], bins: np
     for bin_, sums in compact.items():
         packed[bin_] = sums
     information = packed[:, by_a[:, None, :, None], by_q[None, :, None, :]]
-    return Sums(
-        scores.reshape(len(scores), -1), information.reshape(len(packed), *2 * (by_a.shape[0] * by_q.shape[0],))
-    )
+    scores = scores.reshape(len(scores), -1)
+    return Sums(scores, information.reshape(len(packed), *2 * scores.shape[1:]))
 
 
 def _pair_index(n: int) -> np.ndarray:

@@ -1,13 +1,15 @@
 """Do deployments share their coefficients? A randomisation test for many coefficients at once, under unequal laws.
 
-Q_j = Σ_g S_gj² / c_gj with S_gj = Σ_u a_ugj a sum of independent contributions, of mean zero if nothing reacts, and
-c_gj their summed squares about the mean of each deployment. The laws of the contributions differ, since states and
-inputs follow the policy: labels must not be permuted. Instead every episode, as it stands about the mean of its
-deployment, changes sign at random, all its contributions together, and Q is computed anew, c included. This keeps all
-covariances.
+T_gj = S_gj² / c_gj with S_gj = Σ_u a_ugj a sum of independent contributions, of mean zero if nothing reacts, and c_gj
+their summed squares about the mean of each deployment. The laws of the contributions differ, since states and inputs
+follow the policy: labels must not be permuted. Instead every episode, as it stands about the mean of its deployment,
+changes sign at random, all its contributions together, and T is computed anew, c included. This keeps all covariances.
+The largest T shows a change of one coefficient in one deployment, their sum one that is spread over many.
 As episodes grow in number the law under flips tends to that under the null (the central limit theorem, deployment by
 deployment); no finite number makes it exact.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,17 +18,22 @@ from perfcontrol.identification.deviations import centred
 CHUNK = 2**22  # numbers held at a time
 
 
-def quadratic_statistics(contributions: np.ndarray, group: np.ndarray, signs: np.ndarray) -> np.ndarray:
-    """Q of contributions (U, G, J), observed and under the rows of `signs` (P, U): (P+1, J), the observed first."""
+class Statistics(NamedTuple):
+    """For each coefficient j the largest T_gj over deployments g and the sum: observed, then under flips, (P+1, J)."""
+
+    largest: np.ndarray
+    total: np.ndarray
+
+
+def statistics_of(contributions: np.ndarray, group: np.ndarray, signs: np.ndarray) -> Statistics:
+    """Of contributions (U, G, J), observed and under the rows of `signs` (P, U)."""
     units, groups, count = contributions.shape
     flat = contributions.reshape(units, -1)
     members = [np.flatnonzero(group == h) for h in np.unique(group)]
     residual = centred(contributions, group)
     square = np.sum(residual**2, axis=0)
     negligible = square <= 1e-20 * np.sum(flat**2, axis=0).max(initial=0.0)  # rounding
-    observed = _ratio(flat.sum(axis=0) ** 2, square, negligible)
-    out = np.empty((len(signs) + 1, count))
-    out[0] = observed.reshape(groups, count).sum(axis=0)
+    found = [_ratio(flat.sum(axis=0, keepdims=True) ** 2, square, negligible)]
     step = max(1, CHUNK // max(flat.shape[1], 1))
     for first in range(0, len(signs), step):
         part = signs[first : first + step]
@@ -37,9 +44,9 @@ def quadratic_statistics(contributions: np.ndarray, group: np.ndarray, signs: np
             total += own
             about_mean = np.sum(residual[rows] ** 2, axis=0) - own**2 / len(rows)
             variance += about_mean * len(rows) / max(len(rows) - 1, 1)
-        flipped = _ratio(total**2, variance, negligible)
-        out[1 + first : 1 + first + len(part)] = flipped.reshape(-1, groups, count).sum(axis=1)
-    return out
+        found.append(_ratio(total**2, variance, negligible))
+    by_deployment = [ratio.reshape(-1, groups, count) for ratio in found]
+    return Statistics(*(np.concatenate([reduced(T, axis=1) for T in by_deployment]) for reduced in (np.max, np.sum)))
 
 
 def _ratio(square: np.ndarray, variance: np.ndarray, negligible: np.ndarray) -> np.ndarray:
@@ -53,7 +60,12 @@ def p_values(statistics: np.ndarray) -> np.ndarray:
     return (len(statistics) - below) / len(statistics)
 
 
+def least_of(statistics: np.ndarray) -> np.ndarray:
+    """One statistic from several (P+1, K), (P+1,): the smallest of their p-values, its sign turned."""
+    return -p_values(statistics).min(axis=1)
+
+
 def combined(statistics: np.ndarray) -> float:
     """One p-value from several statistics (P+1, K), the first row observed: that of the smallest of their p-values."""
-    least = p_values(statistics).min(axis=1)
-    return float(np.mean(least <= least[0]))
+    least = least_of(statistics)
+    return float(np.mean(least >= least[0]))

@@ -14,7 +14,7 @@ from perfcontrol.identification.deviations import centred, estimated_deviations,
 from perfcontrol.identification.identify import check_directions
 from perfcontrol.identification.logs import Logs
 from perfcontrol.identification.next_policy import next_policy
-from perfcontrol.identification.randomisation import combined, p_values, quadratic_statistics
+from perfcontrol.identification.randomisation import combined, least_of, p_values, statistics_of
 from perfcontrol.identification.transitions import Transitions, transitions_of
 from perfcontrol.identification.unidentified import untold
 
@@ -92,9 +92,10 @@ def test_reaction(
 
     Null: A, B and the laws of Δ and w are the same under every policy. Paths are not exchangeable under it, since the
     inputs follow the policy; so labels are not permuted. Each episode contributes a score at a common fit, freed of the
-    error of that fit, which has mean zero under every policy; it changes its sign at random, `permutations` times. The
-    largest and the summed squares over deployments of mean coefficients, of the size of perturbations and noise, and of
-    the entries of their covariances are compared with themselves under these flips; one p-value is made of the least.
+    error of that fit, which has mean zero under every policy; it changes its sign at random, `permutations` times. Two
+    statistics are compared with themselves under these flips: the largest studentised change of an entry of A, or of
+    the size of perturbations or noise, in any one deployment; and the sum over all deployments of squared changes of
+    mean coefficients, or of entries of the covariances. The smaller of their p-values makes one p-value.
 
     Exact: given the flips, the p-value accounts for the choice among the statistics and for the number of flips.
     Asymptotic, in the number of episodes of each deployment: that flipped scores have the law of the observed ones, and
@@ -135,34 +136,33 @@ def test_reaction(
 
 
 def _tested(data: Transitions, common: Common, signs: np.ndarray) -> tuple[dict[str, Effect], np.ndarray]:
-    """The effects, and all statistics (P+1, K)."""
-    group = data.group
-
-    def drawn(contributions: np.ndarray) -> np.ndarray:
-        return quadratic_statistics(contributions, group, signs)
-
+    """The effects, and two statistics (P+1, 2): of a change in one place, and of one that is spread out."""
+    group, n = data.group, data.x.shape[1]
     whole, states, root = _mean_coordinates(data, common)
-    mean = drawn(score_deviations(common.mean, group, whole))
+    mean = statistics_of(score_deviations(common.mean, group, whole), group, signs).total.sum(axis=1)
     shift = estimated_deviations(common.mean, group, states)
+    natural = common.root @ shift.reshape(*shift.shape[:2], n, -1) @ root.T
+    entry = statistics_of(natural.reshape(*shift.shape[:2], -1), group, signs).largest.max(axis=1)
 
     sizes = np.stack([common.perturbation, common.noise], axis=1) / _shares(data, common)
     share = estimated_deviations(common.covariance, group, sizes)
     both = score_deviations(common.covariance, group, sizes.sum(axis=1, keepdims=True))
-    size = drawn(np.concatenate([share, both], axis=2))
+    size = statistics_of(np.concatenate([share, both], axis=2), group, signs).largest
     scale = 1 / np.sqrt(np.maximum(np.einsum("gpp->p", common.covariance.information), 1e-300))
-    entries = drawn(score_deviations(common.covariance, group, np.diag(scale)))
+    squares = statistics_of(score_deviations(common.covariance, group, np.diag(scale)), group, signs).total
     noisy = common.noise_entries
-    of_mean = np.stack([mean.max(axis=1), mean.sum(axis=1)], axis=1)
-    of_entries = np.stack([entries[:, ~noisy].sum(axis=1), entries[:, noisy].sum(axis=1)], axis=1)
-    statistics = np.concatenate([of_mean, size.max(axis=1, keepdims=True), of_entries], axis=1)
-    n = data.x.shape[1]
-    natural = common.root @ shift.reshape(*shift.shape[:2], n, -1) @ root.T
+    of_squares = np.stack([squares[:, ~noisy].sum(axis=1), squares[:, noisy].sum(axis=1)], axis=1)
+
+    in_one_place = np.maximum(entry, size.max(axis=1))
+    spread_out = least_of(np.concatenate([mean[:, None], of_squares], axis=1))
+    of_mean = combined(np.stack([entry, mean], axis=1))
+    of_size = p_values(size)[0]
     effects = {
-        "mean": _effect(shift, natural, group, combined(of_mean), n),
-        "perturbation": _effect(share[..., :1], share[..., 0], group, float(p_values(size[:, :1])[0, 0]), 1),
-        "noise": _effect(share[..., 1:], share[..., 1], group, float(p_values(size[:, 1:2])[0, 0]), 1),
+        "mean": _effect(shift, natural, group, of_mean, n),
+        "perturbation": _effect(share[..., :1], share[..., 0], group, float(of_size[0]), 1),
+        "noise": _effect(share[..., 1:], share[..., 1], group, float(of_size[1]), 1),
     }
-    return effects, statistics
+    return effects, np.stack([in_one_place, spread_out], axis=1)
 
 
 def _mean_coordinates(data: Transitions, common: Common) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
