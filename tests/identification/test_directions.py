@@ -6,6 +6,7 @@ import pytest
 
 import perfcontrol as pc
 from perfcontrol.identification.directions import canonical, product_map
+from perfcontrol.identification.joint import joint_scoring
 from perfcontrol.identification.moments import upper
 from tests.identification.worlds import small_policies, small_world
 from tests.tools import assert_close, assert_refused, central_differences
@@ -93,3 +94,20 @@ def test_fitted_cost_does_not_depend_on_whether_directions_were_given_or_found()
 def test_rank_is_refused_unless_it_is_a_count() -> None:
     for rank in (-1, 1.5, "two"):
         assert_refused(lambda rank=rank: fitted(rank=rank), "rank", "at least 0")
+
+
+@pytest.mark.parametrize(("angle", "share"), [(1.2, 1.0), (2.2, 0.3), (1.55, 3.0)])
+def test_scoring_reaches_the_same_fit_from_directions_far_off(angle: float, share: float) -> None:
+    fit = fitted(rank=1, reaction="norm")
+    data, spread = fit.data, fit.estimated.spread
+    residual, features = fit.estimated.location.residual(data), fit.scale_features.values(data.policies)
+    aside = np.array([[[0.0, 1.0], [-0.6, 0.5]]])
+    aside -= np.sum(aside * spread.directions) * spread.directions
+    start = np.cos(angle) * spread.directions + np.sin(angle) * aside / np.linalg.norm(aside)
+    near, far = (
+        joint_scoring(data, residual, features, (spread.noise, scales, D), True)
+        for scales, D in ((spread.scales, spread.directions), (share * spread.scales, start))
+    )
+    assert_close(far.noise, near.noise, 1e-3)
+    assert_close(far.scales**2, near.scales**2, 1e-3)
+    assert_close(symmetrised(far.directions), symmetrised(near.directions), 1e-3)

@@ -116,6 +116,15 @@ def test_what_reacts_is_told_apart_and_its_size_lies_in_the_interval(part: str) 
         assert by_deployment.mean[0] < 0 < by_deployment.mean[1]
 
 
+def test_a_change_of_one_entry_in_one_of_five_deployments_is_seen() -> None:
+    moved = WORLD.but(A=WORLD.A + 0.65 * PART)
+    logs = pc.Logs(*moved.logs(15, POLICIES[:1], 40, 10)) + pc.Logs(*WORLD.logs(16, POLICIES[1:], 40, 10))
+    result = reaction_of(logs)
+    change = result.effect["mean"].by_deployment
+    assert 4.5 < change.mean[0, 0, 1] / change.standard_error[0, 0, 1] < 5.5
+    assert result.p_value is not None and result.p_value <= 0.02
+
+
 def test_known_directions_leave_no_less_to_see() -> None:
     logs = pc.Logs(*WORLD.logs(7, POLICIES[:1], 30, 20))
     logs += pc.Logs(*WORLD.but(scale=lambda M: np.array([0.6])).logs(8, POLICIES[1:2], 30, 20))
