@@ -29,8 +29,8 @@ from perfcontrol.solvers import AbstractSolver, StablePoint
 class Fit:
     """A plant identified from logs. Built by `pc.fit`.
 
-    `A` is the mean of the state matrix at M = 0: the reaction of the mean is counted from there. Estimates have `.mean`,
-    `.standard_error` by the jackknife over episodes, `.degrees_of_freedom` of that error and `.interval(level=0.95)`.
+    `A` is the mean of the state matrix at M = 0: the reaction of the mean is counted from there. Estimates have
+    `.mean`, `.standard_error` by the jackknife over episodes, its `.degrees_of_freedom` and `.interval(level=0.95)`.
 
     Attributes:
         mean_features: what the reaction of the mean follows, `.name` in words.
