@@ -32,6 +32,8 @@ def read_arrays(path: Path, form: str) -> tuple[dict[str, Any], dict[str, np.nda
     """Header and arrays of a file of this format; raises FileNotFoundError, or UnreadableError for other content."""
     try:
         with np.load(path, allow_pickle=False) as file:
+            if any(entry.file_size > entry.compress_size for entry in file.zip.infolist()):
+                raise ValueError("compressed, as nothing that is written here")  # what unpacks may fill the memory
             arrays = {name: file[name] for name in file.files}
         header = json.loads(arrays.pop(HEADER).tobytes().decode())
         if header["format"] != form:

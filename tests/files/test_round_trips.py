@@ -255,6 +255,12 @@ def test_every_result_comes_back(tmp_path):
         assert pc.load(tmp_path / "s.npz").result == result
 
 
+def test_file_that_unpacks_to_more_than_it_is_is_refused(tmp_path):
+    np.savez_compressed(tmp_path / "bomb.npz", M=np.zeros(10**6))
+    with pytest.raises(pc.InputError, match="be a solution that"):
+        pc.load(tmp_path / "bomb.npz")
+
+
 def test_run_comes_back_with_labelled_history(tmp_path):
     names = ["level", "flow"]
     made = problem(system=pc.LinearSystem(draw(n, n) / 3, draw(n, m), names, ["u"]))

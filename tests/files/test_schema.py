@@ -1,24 +1,21 @@
-"""The published JSON schema, as an independent validator reads it, against what the package itself accepts."""
+"""The JSON schema, as an independent validator reads it, against what the package itself accepts."""
 
 import json
+import re
 import tomllib
+from pathlib import Path
 
 import fastjsonschema
 import pytest
 
 import perfcontrol as pc
 from perfcontrol.cli.new import TEMPLATES
-from perfcontrol.files.schema import PUBLISHED, text
+from perfcontrol.files.schema import schema
 
 
 @pytest.fixture(scope="module")
 def valid():
-    return fastjsonschema.compile(json.loads(PUBLISHED.read_text("utf-8")))
-
-
-def test_published_schema_is_that_of_the_rows():
-    # Renew it: python -m perfcontrol.files.schema
-    assert PUBLISHED.read_text("utf-8") == text()
+    return fastjsonschema.compile(json.loads(json.dumps(schema())))
 
 
 @pytest.mark.parametrize("name", TEMPLATES)
@@ -57,3 +54,13 @@ def test_short_forms_are_valid(valid):
     valid({"experiment": "stock_market", "solver": "StablePoint"})
     with pytest.raises(fastjsonschema.JsonSchemaException):
         valid({"experiment": "stock_market", "horizon": 3})
+
+
+def test_files_of_the_documentation_are_valid_and_load(valid, tmp_path):
+    pages = [path.read_text("utf-8") for path in sorted((Path(__file__).parents[2] / "docs").glob("*.md"))]
+    blocks = [block for page in pages for block in re.findall(r"^```toml\n(.*?)^```", page, re.MULTILINE | re.DOTALL)]
+    assert blocks
+    for block in blocks:
+        valid(tomllib.loads(block))
+        (tmp_path / "problem.toml").write_text(block, "utf-8")
+        assert isinstance(pc.load(tmp_path / "problem.toml"), pc.PerformativeProblem)

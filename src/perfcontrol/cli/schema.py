@@ -1,13 +1,12 @@
 """`perfcontrol schema`."""
 
+import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from perfcontrol.cli.app import app, console, in_words
-
-PUBLISHED = Path(__file__).parents[1] / "files" / "problem.schema.json"  # read here without JAX
 
 
 @app.command()
@@ -18,7 +17,9 @@ def schema(
 
     Begin a problem file with the line `#:schema ./problem.schema.json` where an editor knows that comment.
     """
-    text = PUBLISHED.read_text(encoding="utf-8")
+    from perfcontrol.files.schema import schema as made
+
+    text = json.dumps(made(), indent=1, ensure_ascii=False) + "\n"
     if out is None:
         print(text, end="")
         return

@@ -1,15 +1,11 @@
-"""The JSON schema of a problem file, from the rows that read it; `python -m perfcontrol.files.schema` renews it."""
+"""The JSON schema of a problem file, from the rows that read it."""
 
-import json
 import typing
-from pathlib import Path
 from typing import Any, Literal
 
 from perfcontrol.files.building import PLAN
 from perfcontrol.files.registry import ROWS, Argument, Row, parts_of, plain_type, rows_giving
 from perfcontrol.problem import PerformativeProblem
-
-PUBLISHED = Path(__file__).with_name("problem.schema.json")
 
 _SIMPLE: dict[Any, dict[str, Any]] = {
     bool: {"type": "boolean"},
@@ -80,12 +76,3 @@ def _choices(kind: Any) -> list[dict[str, Any]]:
         return [{"type": "array", "items": choices[0] if len(choices) == 1 else {"anyOf": choices}}]
     rows = [row for row in rows_giving(kind) if row.build is not PerformativeProblem]
     return [{"$ref": f"#/$defs/{row.name}"} for row in rows]
-
-
-def text() -> str:
-    """The schema as it is published."""
-    return json.dumps(schema(), indent=1, ensure_ascii=False) + "\n"
-
-
-if __name__ == "__main__":
-    PUBLISHED.write_text(text(), encoding="utf-8")
