@@ -6,8 +6,9 @@
 """
 
 import argparse
+import itertools
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import jax
@@ -18,32 +19,30 @@ from benchmarks import decisions, estimates, reaction_levels  # noqa: E402 - aft
 from benchmarks.plants import plant  # noqa: E402
 
 
-def parts(share: float) -> dict[str, Callable[[], list[str]]]:
-    """The tables by name."""
+def parts(share: float) -> dict[str, Callable[[], Iterable[str]]]:
+    """The tables by name, line by line."""
 
     def count(full: int) -> int:
         return max(1, round(share * full))
 
-    def coverage() -> list[str]:
-        lines = ["| plant | block | parameters | covered | lowest | highest | outside 92-98 % |", "|" + " --- |" * 7]
+    def coverage() -> Iterator[str]:
+        yield "| plant | block | parameters | covered | lowest | highest | outside 92-98 % |"
+        yield "|" + " --- |" * 7
         for seed, n, kind in ((0, 2, "norm"), (4, 3, "matrix and affine")):
             for given in (True, False):
-                lines += estimates.coverage(plant(seed, n, kind), count(500), 40, given)
-        return lines
+                yield from estimates.coverage(plant(seed, n, kind), count(500), 40, given)
 
-    def deciding() -> list[str]:
-        head = "| directions | reaction | systems | solved | median | 90 % | largest | ignoring the reaction, median |"
-        lines = [head, "|" + " --- |" * 8]
+    def deciding() -> Iterator[str]:
+        yield "| directions | reaction | systems | solved | median | 90 % | largest | ignoring the reaction, median |"
+        yield "|" + " --- |" * 8
         for directions in ("given", "estimated"):
-            lines += decisions.end_to_end(count(50), directions)
-        return lines
+            yield from decisions.end_to_end(count(50), directions)
 
-    def ensembles() -> list[str]:
-        head = "| reaction | data sets | members | level | cost | cost of M | policy, entries | certified |"
-        lines = [head, "|" + " --- |" * 8]
+    def ensembles() -> Iterator[str]:
+        yield "| reaction | data sets | members | level | cost | cost of M | policy, entries | certified |"
+        yield "|" + " --- |" * 8
         for reaction in (None, "auto"):
-            lines += decisions.ensembles(count(50), 1, 200, 0.95, reaction)
-        return lines
+            yield from decisions.ensembles(count(50), 1, 200, 0.95, reaction)
 
     return {
         "recovery": lambda: estimates.recovery(count(25), (8, 80, 800)),
@@ -53,6 +52,12 @@ def parts(share: float) -> dict[str, Callable[[], list[str]]]:
         "decisions": deciding,
         "ensembles": ensembles,
     }
+
+
+def _said(line: str) -> str:
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()
+    return line + "\n"
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -65,10 +70,8 @@ def main(arguments: list[str] | None = None) -> None:
     tables = parts(options.share)
     text = ""
     for name in options.only or tables:
-        table = f"## {name}\n\n" + "\n".join(tables[name]()) + "\n\n"
-        sys.stdout.write(table)
-        sys.stdout.flush()
-        text += table
+        for line in itertools.chain((f"## {name}", ""), tables[name](), ("",)):
+            text += _said(line)
     if options.out:
         options.out.write_text(text, encoding="utf-8")
 

@@ -10,13 +10,14 @@ import perfcontrol as pc
 from benchmarks.plants import Plant, plant
 
 EPISODES, HORIZON = 40, 10
+MORE_EPISODES = 100  # with 40, no change of the perturbations is five of its standard errors, which grow with it
 FLIPS = 199
-PILOTS = 30
+PILOTS = 15
 LEVEL = 0.05
 
 
-def _tested(made: Plant, seed: list[int], worlds: list[Plant]) -> pc.ReactionTest:
-    logs = made.logs(np.random.default_rng(seed), EPISODES, HORIZON, worlds)
+def _tested(made: Plant, seed: list[int], worlds: list[Plant], episodes: int = EPISODES) -> pc.ReactionTest:
+    logs = made.logs(np.random.default_rng(seed), episodes, HORIZON, worlds)
     return pc.test_reaction(logs, made.K, permutations=FLIPS, key=jax.random.key(seed[0]))
 
 
@@ -65,11 +66,11 @@ def power(sets: int, states: tuple[int, ...]) -> list[str]:
             def run(size: float, seeds: range, made: Plant = made, part: str = part, shifted=shifted) -> list:
                 worlds = [made.frozen()] * len(made.policies)
                 worlds[1] = shifted(size)
-                tests = [_tested(made, [seed, 2], worlds) for seed in seeds]
+                tests = [_tested(made, [seed, 2], worlds, MORE_EPISODES) for seed in seeds]
                 return [(_in_errors(test, part), test.p_value) for test in tests]
 
             size = 0.3
-            for _ in range(6):  # until the mean estimate is five of its standard errors, which grow with it
+            for _ in range(6):  # until the mean estimate is five of its standard errors
                 seen = run(size, range(1000, 1000 + PILOTS))
                 size *= 5 / float(np.mean([shift for shift, _ in seen]))
             found = run(size, range(sets))

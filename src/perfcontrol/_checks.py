@@ -249,3 +249,13 @@ def check_tolerance(tolerance: float | None, dtype: Any) -> float:
             remedy,
         )
     return float(tolerance)
+
+
+def as_names(argument: str, names: Any, count: int) -> tuple[str, ...] | None:
+    """Names of so many signals, or None."""
+    if names is None:
+        return None
+    names = (names,) if isinstance(names, str) else tuple(names)
+    if len(names) != count or len(set(names)) < count or not all(isinstance(name, str) for name in names):
+        raise fail(argument, f"{list(names)}", f"be {count} different names", "One text for each signal.")
+    return names

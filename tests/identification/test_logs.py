@@ -73,6 +73,44 @@ def test_logs_come_back_bit_for_bit_from_csv_and_dataset(make, tmp_path) -> None
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["logs"]
 
 
+def test_signal_names_go_from_the_system_through_logs_files_and_fit_to_the_controller(tmp_path) -> None:
+    control = pytest.importorskip("control")
+    world = small_world()
+    cost = pc.QuadraticCost(np.eye(2), np.eye(1))
+    problem = pc.PerformativeProblem(
+        system=pc.interop.from_control(
+            control.ss(world.A, world.B, np.eye(2), 0, True, states=["level", "flow"], inputs=["valve"], outputs=2)
+        ),
+        horizon=12,
+        gain=world.K,
+        noise=pc.Uniform(-np.ones(2), np.ones(2)),
+        cost=cost,
+    )
+    logs = pc.Logs.simulate(problem, np.stack(small_policies()[:2]), jax.random.key(0), 4)
+    logs.to_csv(tmp_path / "logs")
+    assert (tmp_path / "logs" / "episode_0.csv").read_text().splitlines()[0] == "t,level,flow,valve"
+    for back in (pc.Logs.from_csv(tmp_path / "logs"), pc.Logs.from_dataset(logs.to_dataset()), logs[:3] + logs[3:]):
+        assert same(back, logs)
+        assert (back.state_names, back.input_names) == (("level", "flow"), ("valve",))
+    fit = pc.fit(pc.Logs.from_csv(tmp_path / "logs"), world.K, directions=world.directions, reaction="constant")
+    table = fit.table()
+    assert float(table["A"].sel(value="estimate", state="flow", from_state="level")) == fit.A.mean[1, 0]
+    assert float(table["B"].sel(value="estimate", state="level", input="valve")) == fit.B.mean[0, 0]
+    fitted = fit.problem(cost=cost, horizon=5)
+    controller = pc.interop.to_control(fitted, small_policies()[1])
+    assert controller.output_labels == ["valve"] and controller.input_labels[:2] == ["level", "flow"]
+    assert fit.ensemble(2, key=jax.random.key(0), cost=cost, horizon=5).system.state_names == ("level", "flow")
+
+
+def test_columns_of_an_episode_are_found_by_the_names_of_the_policies(tmp_path) -> None:
+    logs = pc.Logs(X, U, DEPLOYED, ["level", "flow"], ["valve"])
+    logs.to_csv(tmp_path / "logs")
+    path = tmp_path / "logs" / "episode_2.csv"
+    rows = [line.split(",") for line in path.read_text().splitlines()]
+    path.write_text("\n".join(",".join([u, b, t, a, "note" if t == "t" else "0"]) for t, a, b, u in rows))
+    assert same(pc.Logs.from_csv(tmp_path / "logs"), logs)
+
+
 def test_logs_are_written_whole_or_not_at_all(tmp_path, monkeypatch) -> None:
     logs = pc.Logs(X, U, DEPLOYED)
 
@@ -101,6 +139,15 @@ WRONG = {
     "policies of another number": (lambda: pc.Logs(X, U, DEPLOYED[:5]), "deployed", "(6, memory, 1, 2)"),
     "policy without lags": (lambda: pc.Logs(X, U, DEPLOYED[:, 0]), "deployed", "(6, memory, 1, 2)"),
     "policy transposed": (lambda: pc.Logs(X, U, np.swapaxes(DEPLOYED, -1, -2)), "deployed", "swapped"),
+    "too few names": (lambda: pc.Logs(X, U, DEPLOYED, ["level"]), "state_names", "2 different names"),
+    "one name twice": (lambda: pc.Logs(X, U, DEPLOYED, ["a", "a"]), "state_names", "2 different names"),
+    "a name that is no text": (lambda: pc.Logs(X, U, DEPLOYED, None, [3]), "input_names", "1 different names"),
+    "a state that is an input": (lambda: pc.Logs(X, U, DEPLOYED, ["a", "b"], ["b"]), "input_names", "which are states"),
+    "logs of other signals": (
+        lambda: pc.Logs(X, U, DEPLOYED, ["a", "b"]) + pc.Logs(X, U, DEPLOYED, ["b", "a"]),
+        "state_names",
+        "Reorder",
+    ),
     "missing value in a policy": (lambda: pc.Logs(X, U, with_value(DEPLOYED, (0, 0, 0, 0), np.nan)), "deployed", "nan"),
 }
 
@@ -126,6 +173,12 @@ SPOILED = {
     "a cell too many": (lambda d: spoil(d, "episode_0.csv", "\n1,", "\n1,2,"), "episode_0.csv", "5 cells in line 3"),
     "unknown policy": (lambda d: spoil(d, "episodes.csv", "episode_0.csv,0", "episode_0.csv,9"), "episodes.csv", "9"),
     "lag left out": (lambda d: spoil(d, "policies.csv", "\n1,1,", "\n1,2,"), "policies.csv", "lags [2.0] of policy 1"),
+    "a signal without its column": (lambda d: spoil(d, "policies.csv", ",x1", ",y"), "episode_0.csv", "Missing: y"),
+    "policies of two shapes": (
+        lambda d: (d / "policies.csv").write_text((d / "policies.csv").read_text() + "1,2,u0,0.0,0.0\n"),
+        "policies.csv",
+        "of one shape",
+    ),
     "empty index": (lambda d: (d / "episodes.csv").write_text(""), "episodes.csv", "columns"),
 }
 

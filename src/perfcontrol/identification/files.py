@@ -11,7 +11,7 @@ import numpy as np
 
 from perfcontrol._checks import fail
 
-Contents = tuple[Any, Any, Any]  # x, u, deployed, as `Logs` takes them
+Contents = tuple[Any, Any, Any, Any, Any]  # x, u, deployed, names of states and inputs, as `Logs` takes them
 
 EPISODES, POLICIES = "episodes.csv", "policies.csv"
 
@@ -31,8 +31,8 @@ def to_csv(logs: Any, folder: Path) -> None:
 
 
 def _write(logs: Any, folder: Path) -> None:
-    states = [f"x{i}" for i in range(logs.state_size)]
-    inputs = [f"u{i}" for i in range(logs.input_size)]
+    states = list(logs.state_names or _numbered("x", logs.state_size))
+    inputs = list(logs.input_names or _numbered("u", logs.input_size))
     width = len(str(len(logs) - 1))
     names = [f"episode_{e:0{width}d}.csv" for e in range(len(logs))]
     for name, x, u in zip(names, logs.x, logs.u, strict=True):
@@ -52,6 +52,10 @@ def _write(logs: Any, folder: Path) -> None:
     )
 
 
+def _numbered(letter: str, count: int) -> list[str]:
+    return [f"{letter}{i}" for i in range(count)]
+
+
 def _write_rows(path: Path, header: list[str], rows: Any) -> None:
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
@@ -64,20 +68,33 @@ def from_csv(folder: Path) -> Contents:
     if not folder.is_dir():
         raise fail("folder", str(folder), "be a folder of logs", f"It holds {EPISODES}, {POLICIES} and the episodes.")
     names, index = _read(folder / EPISODES, ["file", "policy"], ["file"])
-    _, table = _read(folder / POLICIES, ["policy", "lag", "input"], ["input"])
+    text, table = _read(folder / POLICIES, ["policy", "lag", "input"], ["input"])
     policies = _policies(folder / POLICIES, table)
+    states = [column for column in _header(folder / POLICIES) if column not in ("policy", "lag", "input")]
+    named = list(dict.fromkeys(text["input"]))
     x, u, deployed = [], [], []
     for name, (policy,) in zip(names["file"], index[:, :1], strict=True):
         if policy not in policies:
             raise fail(EPISODES, f"policy {policy:g}", f"name policies of {POLICIES}", "Add its rows there.")
-        states, inputs = _read_episode(folder / name)
-        x.append(states)
-        u.append(inputs)
+        x_e, u_e = _read_episode(folder / name, states, named)
+        x.append(x_e)
+        u.append(u_e)
         deployed.append(policies[policy])
     shapes = {policy.shape for policy in deployed}
     if len(shapes) > 1:
         raise fail(POLICIES, f"policies of shapes {sorted(shapes)}", "be all of one shape", "Fill lags with zeros.")
-    return (x, u, np.stack(deployed)) if deployed else ([], [], [])
+    if not deployed:
+        return [], [], [], None, None
+    return x, u, np.stack(deployed), _unless_numbered("x", states), _unless_numbered("u", named)
+
+
+def _unless_numbered(letter: str, names: list[str]) -> list[str] | None:
+    return None if names == _numbered(letter, len(names)) else names
+
+
+def _header(path: Path) -> list[str]:
+    with path.open(newline="", encoding="utf-8") as file:
+        return [column.strip() for column in next(csv.reader(file))]
 
 
 def _read(path: Path, required: list[str], text: list[str]) -> tuple[dict[str, list[str]], np.ndarray]:
@@ -121,19 +138,15 @@ def _policies(path: Path, table: np.ndarray) -> dict[float, np.ndarray]:
     return found
 
 
-def _read_episode(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    _, numbers = _read(path, ["t"], [])
-    with path.open(newline="", encoding="utf-8") as file:
-        header = [column.strip() for column in next(csv.reader(file))]
-    columns = {kind: [i for i, c in enumerate(header) if c[:1] == kind and c[1:].isdigit()] for kind in "xu"}
-    for kind in columns.values():
-        kind.sort(key=lambda i: int(header[i][1:]))
+def _read_episode(path: Path, states: list[str], inputs: list[str]) -> tuple[np.ndarray, np.ndarray]:
+    _, numbers = _read(path, ["t", *states, *inputs], [])
+    header = _header(path)
     t = numbers[:, header.index("t")]
     if len(t) > 1 and not np.all(np.diff(t) == 1):
         line = int(np.argmax(np.diff(t) != 1)) + 2
         got = f"t = {t[line - 2]:g} then {t[line - 1]:g} in line {line + 1}"
         raise fail(path.name, got, "have consecutive times", "Cut the episode at the gap.")
-    x, u = numbers[:, columns["x"]], numbers[:, columns["u"]]
+    x, u = (numbers[:, [header.index(name) for name in names]] for names in (states, inputs))
     return x, u[:-1] if len(u) and np.all(np.isnan(u[-1])) else u
 
 
@@ -157,8 +170,14 @@ def to_dataset(logs: Any) -> Any:
             "transitions": (("episode",), np.array([len(x) - 1 for x in logs.x])),
             "deployment": (("episode",), logs.deployment),
         },
-        coords={"lag": np.arange(1, logs.memory + 1)},
+        coords={"lag": np.arange(1, logs.memory + 1), **labels(logs)},
     )
+
+
+def labels(logs: Any) -> dict[str, Any]:
+    """Coordinates of the dimensions state and input, where the signals have names."""
+    named = {"state": logs.state_names, "input": logs.input_names}
+    return {dim: list(names) for dim, names in named.items() if names is not None}
 
 
 def from_dataset(dataset: Any) -> Contents:
@@ -176,11 +195,17 @@ def from_dataset(dataset: Any) -> Contents:
             got = f"{name} over {tuple(dataset[name].dims)}"
             raise fail("dataset", got, f"hold {name} over {dims}", "Rename its dimensions.")
     x, u, deployed = (dataset[name].transpose(*dims).values for name, dims in axes.items())
+    states, controls = _named(dataset, "state"), _named(dataset, "input")
     if "transitions" not in dataset:
-        return x, u, deployed
+        return x, u, deployed, states, controls
     lengths = dataset["transitions"].values.astype(int).tolist()
     inputs = [_trimmed(row[: length + 1], length) for row, length in zip(u, lengths, strict=True)]
-    return [row[: length + 1] for row, length in zip(x, lengths, strict=True)], inputs, deployed
+    return [row[: length + 1] for row, length in zip(x, lengths, strict=True)], inputs, deployed, states, controls
+
+
+def _named(dataset: Any, dimension: str) -> list[str] | None:
+    names = dataset[dimension].values.tolist() if dimension in dataset.coords else []
+    return names if names and isinstance(names[0], str) else None
 
 
 def _trimmed(inputs: np.ndarray, length: int) -> np.ndarray:

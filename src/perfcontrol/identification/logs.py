@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from perfcontrol._checks import check_integer, check_key, fail
+from perfcontrol._checks import as_names, check_integer, check_key, fail
 from perfcontrol.evaluate import simulate
 from perfcontrol.identification.files import from_csv, from_dataset, to_csv, to_dataset
 from perfcontrol.problem import PerformativeProblem
@@ -24,9 +24,12 @@ class Logs(eqx.Module):
         x: states, (E, T+1, n), or a list of E arrays (T_e+1, n) where lengths differ.
         u: inputs, (E, T, m) or (E, T+1, m) (the input of the last state tells nothing of the dynamics), or a list.
         deployed: (E, memory, m, n), the full policy in force in each episode; (memory, m, n) if it was always the same.
+        state_names: n names of the states, or None. Files, tables and fitted systems carry them.
+        input_names: m names of the inputs, or None.
 
     Raises:
-        InputError: shapes that do not fit one another, missing or infinite values, an episode without a transition.
+        InputError: shapes that do not fit one another, missing or infinite values, an episode without a transition,
+            names that do not tell all signals apart.
 
     `policies` (G, memory, m, n) are the different policies in order of appearance, and `deployment` (E,) says which of
     them each episode belongs to.
@@ -37,8 +40,10 @@ class Logs(eqx.Module):
     deployed: np.ndarray
     policies: np.ndarray
     deployment: np.ndarray
+    state_names: tuple[str, ...] | None = eqx.field(static=True)
+    input_names: tuple[str, ...] | None = eqx.field(static=True)
 
-    def __init__(self, x: Any, u: Any, deployed: Any):
+    def __init__(self, x: Any, u: Any, deployed: Any, state_names: Any = None, input_names: Any = None):
         self.x = _episodes("x", x, "(episode, time, state)")
         self.u = _episodes("u", u, "(episode, time, input)")
         if len(self.x) != len(self.u):
@@ -58,6 +63,12 @@ class Logs(eqx.Module):
             raise fail("deployed", f"policies of shape {deployed.shape[1:]}", f"have shape (memory, {m}, {n})", hint)
         self.deployed = deployed + 0.0  # a copy, in which -0.0 and 0.0 are the same policy
         self.policies, self.deployment = _grouped(self.deployed)
+        self.state_names = as_names("state_names", state_names, n)
+        self.input_names = as_names("input_names", input_names, m)
+        shared = set(self.state_names or ()) & set(self.input_names or ())
+        if shared:
+            required = "be none of the states"
+            raise fail("input_names", f"{sorted(shared)}, which are states", required, "A signal is one or the other.")
 
     @classmethod
     def simulate(cls, problem: PerformativeProblem, policies: Any, key: Any, episodes: int) -> "Logs":
@@ -84,6 +95,8 @@ class Logs(eqx.Module):
             np.concatenate([np.asarray(path.x) for path in paths]),
             np.concatenate([np.asarray(path.u) for path in paths]),
             np.repeat(np.stack([np.asarray(M) for M in lifted]), episodes, axis=0),
+            problem.system.state_names,
+            problem.system.input_names,
         )
 
     @property
@@ -110,13 +123,16 @@ class Logs(eqx.Module):
         return len(self.x)
 
     def __add__(self, other: "Logs") -> "Logs":
-        """The episodes of both."""
-        return Logs(self.x + other.x, self.u + other.u, np.concatenate([self.deployed, other.deployed]))
+        """The episodes of both, of the same signals."""
+        deployed = np.concatenate([self.deployed, other.deployed])
+        names = (_common(self, other, kind) for kind in ("state_names", "input_names"))
+        return Logs(self.x + other.x, self.u + other.u, deployed, *names)
 
     def __getitem__(self, episodes: Any) -> "Logs":
         """The episodes of a slice, a list of indices or a mask."""
         chosen = np.atleast_1d(np.arange(len(self))[episodes])
-        return Logs([self.x[e] for e in chosen], [self.u[e] for e in chosen], self.deployed[chosen])
+        x, u = [self.x[e] for e in chosen], [self.u[e] for e in chosen]
+        return Logs(x, u, self.deployed[chosen], self.state_names, self.input_names)
 
     def __str__(self) -> str:
         counts = np.bincount(self.deployment)
@@ -141,7 +157,7 @@ class Logs(eqx.Module):
 
     @classmethod
     def from_csv(cls, folder: str | Path) -> "Logs":
-        """Logs from a folder as `to_csv` writes it."""
+        """Logs from a folder as `to_csv` writes it. `policies.csv` names the signals, a column each of the episodes."""
         return cls(*from_csv(Path(folder)))
 
 
@@ -193,3 +209,11 @@ def _grouped(deployed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     first: dict[bytes, int] = {}
     deployment = np.array([first.setdefault(policy.tobytes(), len(first)) for policy in deployed])
     return np.stack([deployed[np.argmax(deployment == g)] for g in range(len(first))]), deployment
+
+
+def _common(one: Logs, other: Logs, kind: str) -> tuple[str, ...] | None:
+    """The names that two logs share; those of the other where one has none."""
+    first, second = getattr(one, kind), getattr(other, kind)
+    if first is not None and second is not None and first != second:
+        raise fail(kind, f"{list(first)} and {list(second)}", "be the same in both logs", "Reorder one of them.")
+    return first or second

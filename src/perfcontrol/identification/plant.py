@@ -33,15 +33,21 @@ class Coefficients(eqx.Module):
 
 
 def build(
-    c: Coefficients, *, features: tuple[Features, Features], law: str, initial_state: Any, **world: Any
+    c: Coefficients,
+    *,
+    features: tuple[Features, Features],
+    names: tuple[Any, Any],
+    law: str,
+    initial_state: Any,
+    **world: Any,
 ) -> PerformativeProblem:
-    """The problem of coefficients by the features of mean and scale; works under vmap over `c`."""
+    """The problem of coefficients by the features of mean and scale; `names` of states and inputs; works under vmap."""
     c = jax.tree.map(lambda numbers: jnp.asarray(numbers, float), c)
     if initial_state is None:
         initial_state = Gaussian(c.start_mean, c.start_covariance)
     return PerformativeProblem(
         initial_state=initial_state,
-        system=LinearSystem(c.A, c.B),
+        system=LinearSystem(c.A, c.B, *names),
         noise=Gaussian(c.noise_mean, c.noise_covariance),
         perturbation=_perturbation(c, *features, law),
         **world,

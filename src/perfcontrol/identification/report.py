@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from perfcontrol.identification.files import labels
 from perfcontrol.identification.parameter import Parameter
 
 VALUES = ("estimate", "standard_error", "low", "high")
@@ -19,7 +20,7 @@ def table(fit: Any) -> Any:
     import xarray
 
     acted = "from_state" if fit.mean_reaction.mean.shape[2] == fit.logs.state_size else "from_both"
-    labels = {
+    dimensions = {
         "A": ("state", "from_state"),
         "B": ("state", "input"),
         "noise_mean": ("state",),
@@ -29,10 +30,16 @@ def table(fit: Any) -> Any:
         "deployed_scale": ("deployment", "direction"),
         "directions": ("direction", "state", acted),
     }
-    variables = {name: (("value", *dims), interval(getattr(fit, name))) for name, dims in labels.items()}
+    named = labels(fit.logs)
+    states, inputs = named.get("state"), named.get("input")
+    if states is not None:
+        named["from_state"] = states
+    if states is not None and inputs is not None and acted == "from_both":
+        named["from_both"] = [*states, *inputs]
+    variables = {name: (("value", *dims), interval(getattr(fit, name))) for name, dims in dimensions.items()}
     return xarray.Dataset(
         variables,
-        coords={"value": list(VALUES)},
+        coords={"value": list(VALUES), **named},
         attrs={
             "mean_features": fit.mean_features.name,
             "scale_features": fit.scale_features.name,

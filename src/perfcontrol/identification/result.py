@@ -281,6 +281,7 @@ class Fit:
             initial_state = Constant(first[0])
         return {
             "features": (self.mean_features, self.scale_features),
+            "names": (self.logs.state_names, self.logs.input_names),
             "gain": self.gain if self.gain.ndim else float(self.gain),
             "memory": self.data.policies.shape[1],
             "initial_state": initial_state,

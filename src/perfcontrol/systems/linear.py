@@ -5,7 +5,7 @@ from typing import Any
 import equinox as eqx
 from jaxtyping import Array
 
-from perfcontrol._checks import as_array, check_shape, fail
+from perfcontrol._checks import as_array, as_names, check_shape, fail
 from perfcontrol._linalg import Diagonal
 
 
@@ -51,8 +51,8 @@ class LinearSystem(eqx.Module):
                 "Give both the same length, or one of them constant.",
             )
 
-        self.state_names = _names("state_names", state_names, n)
-        self.input_names = _names("input_names", input_names, self.B.shape[-1])
+        self.state_names = as_names("state_names", state_names, n)
+        self.input_names = as_names("input_names", input_names, self.B.shape[-1])
 
     @classmethod
     def diagonal(cls, a: Any, b: Any) -> "LinearSystem":
@@ -83,12 +83,3 @@ class LinearSystem(eqx.Module):
     def horizon(self) -> int | None:
         """T where a matrix varies in time, else None."""
         return self.A.shape[0] if self.A.ndim == 3 else self.B.shape[0] if self.B.ndim == 3 else None
-
-
-def _names(argument: str, names: Any, count: int) -> tuple[str, ...] | None:
-    if names is None:
-        return None
-    names = (names,) if isinstance(names, str) else tuple(names)
-    if len(names) != count or len(set(names)) < count or not all(isinstance(name, str) for name in names):
-        raise fail(argument, f"{list(names)}", f"be {count} different names", "One text for each signal.")
-    return names
