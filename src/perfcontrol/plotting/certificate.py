@@ -8,19 +8,19 @@ from matplotlib.axes import Axes
 from perfcontrol._checks import check_instance, fail
 from perfcontrol.plotting.style import LOOKS, styled
 from perfcontrol.plotting.subjects import panels
-from perfcontrol.theory import Certificate
+from perfcontrol.theory import Certificate, Sharp
 
 COMPARABLE = 20.0  # the ratio of both sides up to which they are shown on one axis
 
 
 def plot_certificate(certificate: Certificate, *, ax: Any = None) -> Axes:
-    """What each sensitivity ε_t adds to the left side of a certificate.
+    """What each sensitivity ε_t adds to the left side of a certificate; of the sharp one what each reaction Δ_t adds.
 
     Where both sides are of one size (up to a factor of 20), also their running sum, and the right side that it must
     stay below. The title says both sides.
 
     Args:
-        certificate: with contributions, as of `pc.certify(problem, "rigorous")` or "paper".
+        certificate: with contributions, as of `pc.certify(problem, "rigorous")`, "paper" or `pc.Sharp(by_time=True)`.
         ax: Matplotlib axes; None makes a figure.
 
     Returns:
@@ -36,9 +36,8 @@ def plot_certificate(certificate: Certificate, *, ax: Any = None) -> Axes:
     with styled():
         axes = panels(ax, 1, (4.2, 2.8))[0]
         t = np.arange(len(shares))
-        axes.bar(
-            t, shares, width=0.85, color=LOOKS["optimal"].colour, alpha=0.6, label=r"contribution of $\varepsilon_t$"
-        )
+        label = r"contribution of $\Delta_t$" if certificate.kind == Sharp.name else r"contribution of $\varepsilon_t$"
+        axes.bar(t, shares, width=0.85, color=LOOKS["optimal"].colour, alpha=0.6, label=label)
         if comparable:
             axes.step(t, np.cumsum(shares), where="mid", color=LOOKS["stable"].colour, label="sum so far")
             axes.axhline(limit, color="#7F7F7F", linestyle=(0, (5, 2)), label="must stay below")
@@ -47,7 +46,7 @@ def plot_certificate(certificate: Certificate, *, ax: Any = None) -> Axes:
         axes.set_axisbelow(True)
         axes.set_xlim(-0.7, len(shares) - 0.3)
         axes.set_xlabel("time $t$")
-        axes.set_ylabel(r"contribution of $\varepsilon_t$")
+        axes.set_ylabel(label)
         sign, verdict = ("<", "holds") if certificate.holds else (r"\geq", "does not hold")
         axes.set_title(f"{certificate.kind}: {total:.3g} ${sign}$ {limit:.3g}, {verdict}")
     return axes
@@ -62,6 +61,6 @@ def contributions_of(certificate: Certificate) -> np.ndarray:
     if certificate.contributions is None:
         kind = certificate.kind
         got = f"one of kind {kind!r}, not applicable here" if not certificate.applicable else f"one of kind {kind!r}"
-        remedy = 'Pass pc.certify(problem, "rigorous"); where that is not applicable, its `missing` says what to add.'
+        remedy = 'Pass pc.certify(problem, pc.Sharp(by_time=True)), or "rigorous"; `missing` says what to add.'
         raise fail("certificate", got, "have contributions", remedy)
     return np.asarray(certificate.contributions, dtype=float)

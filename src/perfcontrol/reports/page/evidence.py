@@ -3,6 +3,7 @@
 import numpy as np
 
 from perfcontrol._printing import number as short
+from perfcontrol.plotting.certificate import contributions_of
 from perfcontrol.reports.page.figures import Gallery, legend
 from perfcontrol.reports.page.findings import STEPS, Findings
 from perfcontrol.reports.page.markup import (
@@ -18,6 +19,7 @@ from perfcontrol.reports.page.markup import (
 )
 from perfcontrol.results import versions
 from perfcontrol.solvers import Result
+from perfcontrol.theory import Sharp
 
 
 def convergence(found: Findings, gallery: Gallery) -> Html:
@@ -96,19 +98,24 @@ def distribution(found: Findings, gallery: Gallery) -> Html:
 
 
 def contributions(found: Findings, gallery: Gallery) -> Html:
-    """What each sensitivity adds to a certificate."""
-    body = Html("")
-    for one in found.certificates:
-        if one.contributions is not None and np.all(np.isfinite(one.contributions)):
-            worst = int(np.argmax(one.contributions))
-            body += subheading(f"In the {one.kind} certificate")
-            caption = joined(
-                ["Sum ", number(one.lhs, 4), f", which {'is' if one.holds else 'is not'} below ", number(one.rhs, 4),
-                 f"; most comes from t = {worst}."]
-            )  # fmt: skip
-            body += figures(gallery.contributions(one), caption)
-    if body:
-        return Html(body)
+    """What each time adds to the certificates that split, the exact local rate first."""
+    split = [
+        one for one in found.certificates if one.contributions is not None and np.isfinite(one.contributions).all()
+    ]
+    split.sort(key=lambda one: one.kind != Sharp.name)
+    if split:
+        parts = []
+        for one in split:
+            sides = f"{one.lhs:.4g} {'<' if one.holds else '≥'} {one.rhs:.4g}"
+            parts.append(f"{one.kind}, {sides}, most from t = {int(np.argmax(contributions_of(one)))}")
+        caption = (
+            "What each time adds to the left side of a certificate. Sharp: exactly, how fast the local rate of "
+            "retraining grows with the reaction of Δ_t. The others: the sensitivity ε_t times how far it carries, in "
+            "their bounds. "
+            f"{'; '.join(parts)}."
+        )
+        headings = ["Local rate (sharp)" if one.kind == Sharp.name else f"Bound ({one.kind})" for one in split]
+        return figures([gallery.contributions(one) for one in split], caption, headings)
     lacking = Html('what the others lack is said under <a href="#existence">Does a stable policy exist?</a>')
     return Html(missing("No certificate that splits by time is applicable: ").replace("</p>", f"{lacking}.</p>"))
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from perfcontrol.plotting.certificate import plot_certificate
+from perfcontrol.plotting.certificate import contributions_of, plot_certificate
 from perfcontrol.plotting.convergence import plot_convergence
 from perfcontrol.plotting.costs import plot_costs
 from perfcontrol.plotting.landscape_figure import VIEWS, draw_view
@@ -82,15 +82,15 @@ class Gallery:
         alt = f"Histogram of the cost over {found.samples} simulated paths of each policy. Means: {means}."
         return [self._drawn(4.0, 2.8, alt, lambda axes: plot_costs(found.problem, found.paths, ax=axes))]
 
-    def contributions(self, certificate: Certificate) -> list[Drawing]:
+    def contributions(self, certificate: Certificate) -> Drawing:
         """One figure."""
-        shares = np.asarray(certificate.contributions)
+        shares = contributions_of(certificate)
         alt = (
-            f"What each sensitivity adds to the left side of the {certificate.kind} certificate, over time. The "
+            f"What each time adds to the left side of the {certificate.kind} certificate. The "
             f"largest, {np.max(shares):.3g}, comes from t = {int(np.argmax(shares))}; the sum is {certificate.lhs:.4g} "
             f"and must stay below {certificate.rhs:.4g}."
         )
-        return [self._drawn(4.0, 2.7, alt, lambda axes: plot_certificate(certificate, ax=axes))]
+        return self._drawn(*PANEL, alt, lambda axes: plot_certificate(certificate, ax=axes))
 
     def landscape(self) -> list[Drawing]:
         """Two or three views."""

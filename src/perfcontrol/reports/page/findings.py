@@ -217,7 +217,9 @@ def _convergence(found: Findings) -> None:
 def _kind(found: Findings, kind: str) -> Any:
     """The kind to certify with: the sharp one is told the stable policy, so that it does not look for it again."""
     stable = found.policies.get("stable")
-    return Sharp(M=stable) if kind == Sharp.name and found.exact and stable is not None else kind
+    if kind != Sharp.name or not found.exact:
+        return kind
+    return Sharp(M=stable, by_time=True)
 
 
 def _landscape(found: Findings) -> None:

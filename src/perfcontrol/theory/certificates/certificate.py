@@ -27,7 +27,8 @@ class Certificate:
         rate: its bound of the contraction rate of Φ (sharp: the local rate itself).
         weights: (T,), what one unit of ε_t adds to lhs: the propagation and aggregation of sensitivities; None for
             kinds that do not split that way.
-        contributions: (T,), ε_t times weights.
+        contributions: (T,), ε_t times weights; of the sharp kind what the reaction of each Δ_t adds to the rate
+            (`pc.Sharp(by_time=True)`). None where the kind does not split that way.
         assumptions: what the verdict rests on.
         values: further numbers, by name.
         notes: remarks, in sentences.

@@ -15,6 +15,7 @@ from perfcontrol.theory.derivatives import obstacles
 from perfcontrol.theory.existence import Existence, existence
 from perfcontrol.theory.stability.contraction import contraction_estimate
 from perfcontrol.theory.stability.local_model import LocalModel, largest_mean_step, local_model, spectral_radius
+from perfcontrol.theory.stability.rate_by_time import rate_by_time
 from perfcontrol.theory.stability.safe_step import JACOBIAN_SAMPLES, stability_of
 from perfcontrol.theory.stability.stable_policy import find_stable_policy, proves_absence
 
@@ -28,6 +29,7 @@ class Sharp(AbstractCertificateKind):
         batch: paths a step of RSGD.
         samples: of the gradient's Jacobian, for the mean-square step; 0 leaves that out.
         pairs: of policies for the global estimate; 0 leaves it out.
+        by_time: whether to say what the reaction of each Δ_t adds to the rate (`.contributions`).
         key: JAX random key of these samples; a fixed one if None.
 
     Raises:
@@ -41,6 +43,7 @@ class Sharp(AbstractCertificateKind):
     batch: int = 1
     samples: int = JACOBIAN_SAMPLES
     pairs: int = 8
+    by_time: bool = False
     key: Any = None
 
     name: ClassVar[str] = "sharp"
@@ -108,7 +111,13 @@ class Sharp(AbstractCertificateKind):
                 f"Over sampled pairs of feasible policies, far ones included, the best response stretched distances by "
                 f"at most {stretch:.3g} (an estimate; the test itself is only local)."
             )
-        return self.conclude(rate, 1.0, exists, tuple(assumptions), values=values, notes=tuple(notes))
+        shares = rate_by_time(problem, model) if self.by_time else None
+        if shares is not None and rate > 0:
+            worst = int(np.argmax(shares))
+            notes.append(f"The reaction at t = {worst} adds most to the rate ({shares[worst] / rate:.0%}).")
+        return self.conclude(
+            rate, 1.0, exists, tuple(assumptions), contributions=shares, values=values, notes=tuple(notes)
+        )
 
     def _mean_square(
         self, problem: PerformativeProblem, model: LocalModel, mean_step: float, values: dict[str, Any]

@@ -22,14 +22,16 @@ from perfcontrol.theory.stability.mean_square import mean_field_threshold
 class LocalModel(NamedTuple):
     """First-order model of RRM and RSGD at a stable policy M.
 
-    response_jacobian: Φ' on the tangent space, (q, q). drift: 𝐇+𝐄 there, (q, q). basis: (p, q). damping: step ->
-    derivative of the projection on the tangent space, or None where that is the identity (flat constraints).
+    response_jacobian: Φ' = answer 𝐄 on the tangent space, (q, q). drift: 𝐇+𝐄 there, (q, q). basis: (p, q). answer: how
+    Φ answers a change of the gradient, (q, q); -𝐇⁻¹ where constraints are flat. damping: step -> derivative of the
+    projection on the tangent space, or None where that is the identity (flat constraints).
     """
 
     M: np.ndarray
     response_jacobian: np.ndarray
     drift: np.ndarray
     basis: np.ndarray
+    answer: np.ndarray
     damping: Callable[[float], np.ndarray] | None
 
 
@@ -46,7 +48,7 @@ def local_model(problem: PerformativeProblem, M: Any) -> LocalModel:
     slope, eye = basis.T @ slope @ basis, np.eye(basis.shape[1])
     # Φ(M') = Proj(Φ - η g(Φ; M')), differentiated in the tangent space; without curvature this is -H⁻¹E.
     system = eye - slope + small * slope @ H
-    response = np.linalg.lstsq(system, -small * slope @ E, rcond=1e-13)[0] if basis.size else np.zeros((0, 0))
+    answer = np.linalg.lstsq(system, -small * slope, rcond=1e-13)[0] if basis.size else np.zeros((0, 0))
     damping: Callable[[float], np.ndarray] | None = None
     if basis.size and np.abs(slope - eye).max() > 1e-6:
 
@@ -55,7 +57,7 @@ def local_model(problem: PerformativeProblem, M: Any) -> LocalModel:
 
         damping = curved
 
-    return LocalModel(M, response, H + E, basis, damping)
+    return LocalModel(M, answer @ E, H + E, basis, answer, damping)
 
 
 def spectral_radius(matrix: np.ndarray) -> float:
