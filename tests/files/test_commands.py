@@ -66,6 +66,7 @@ def test_solve_does_what_the_same_program_does_and_keeps_it(file, tmp_path):
     assert kept.history.sizes["step"] == 31
     assert "which holds" in run("solve", file, "--out", tmp_path / "run", status=2).stderr
     assert "has ended" in run("resume", tmp_path / "run").stdout
+    assert "perfcontrol new nowhere.toml" in run("solve", "nowhere.toml", status=2).stderr.replace("\n", " ")
 
 
 def test_solve_says_what_is_certified_and_ends_with_one_where_the_method_fails(file, tmp_path):
@@ -181,6 +182,7 @@ def test_simulate_agrees_with_the_exact_cost_and_writes_the_paths(file, tmp_path
     found = said("simulate", file, *options, "--out", tmp_path / "paths.nc")
     exact = pc.expected_cost(pc.load(file), [[[0.2]]], deployed=[[[-0.4]]])
     assert abs(found["mean_cost"] - exact) < 5 * found["standard_error"]
+    assert found["expected_cost"] == pytest.approx(float(exact), rel=1e-12)
     paths = load_dataset(tmp_path / "paths.nc")
     assert paths.x.shape == (4000, 4, 1) and float(paths.cost.mean()) == pytest.approx(found["mean_cost"])
     assert "mean" in run("simulate", file, "--samples", 10).stdout

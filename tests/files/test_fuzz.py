@@ -13,7 +13,7 @@ from perfcontrol.files.registry import ROWS
 from perfcontrol.files.writing import toml_text
 
 BASES = [path.read_text() for path in TEMPLATES.values()]
-LITTLE = {"max_examples": 100, "deadline": None, "suppress_health_check": [HealthCheck.function_scoped_fixture]}
+LITTLE = {"max_examples": 50, "deadline": None, "suppress_health_check": [HealthCheck.function_scoped_fixture]}
 
 numbers = st.one_of(
     st.integers(-3, 5),

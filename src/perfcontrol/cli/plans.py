@@ -27,11 +27,16 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print the outcome as JSON,
 
 def plan_in(path: Path, settings: list[str] | None = None, seed: int | None = None) -> "Plan":
     """The plan of a problem file or run folder, with changes."""
+    from perfcontrol._checks import fail
     from perfcontrol.files.building import plan_of
     from perfcontrol.files.changing import changed
     from perfcontrol.files.document import read_document
     from perfcontrol.files.run import PROBLEM
 
+    if not path.exists():
+        raise fail(
+            "file", f"{path}, which does not exist", "be a problem file", f"`perfcontrol new {path}` writes one."
+        )
     document = read_document(path / PROBLEM if path.is_dir() else path)
     plan = plan_of(changed(document, settings or []))
     return plan if seed is None else replace(plan, seed=seed)

@@ -57,6 +57,7 @@ def simulate(
         "seed": plan.seed,
         "mean_cost": float(cost.mean()),
         "standard_error": float(cost.std(ddof=1) / np.sqrt(samples)),
+        "expected_cost": _exact(problem, M, other),
         "cost_quantiles": {str(p): float(np.percentile(cost, p)) for p in PERCENT},
     }
     for name, values, names in (
@@ -76,6 +77,17 @@ def simulate(
         print(json.dumps(found, indent=2, allow_nan=False, ensure_ascii=False))
     else:
         _show(found, problem.horizon, out)
+
+
+def _exact(problem: Any, M: Any, deployed: Any) -> float | None:
+    """The expected cost where moments are known: of heavy tails a sample mean says little."""
+    from perfcontrol._checks import InputError
+    from perfcontrol.evaluate import expected_cost
+
+    try:
+        return float(expected_cost(problem, M, deployed=deployed))
+    except (InputError, OverflowError):
+        return None
 
 
 def _own(file: Path, plan: Any) -> Any:
@@ -129,6 +141,10 @@ def _show(found: dict[str, Any], horizon: int, out: Path | None) -> None:
         f"cost: mean {found['mean_cost']:.6g} ± {found['standard_error']:.2g}; "
         f"5 %, 50 %, 95 %: {low:.4g}, {middle:.4g}, {high:.4g}",
     ]
+    exact, mean, error = found["expected_cost"], found["mean_cost"], found["standard_error"]
+    if exact is not None:
+        far = "; rare paths that are much dearer decide it" if abs(exact - mean) > 5 * error else ""
+        lines.append(f"exact expected cost: {exact:.6g}{far}")
     for line in lines:
         console.print(line, highlight=False, markup=False, soft_wrap=True)
     table = Table("signal", "mean", "standard deviation", caption="over time and paths")

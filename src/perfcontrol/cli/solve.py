@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 KINDS = ("paper", "rigorous", "global", "sharp")
 STATUSES = ("proved", "declared", "estimated")  # from the strongest on
 CHECKPOINT = "checkpoint"
+ROWS, COLUMNS = 12, 8  # of a policy that is printed
 
 
 @app.command()
@@ -98,11 +99,32 @@ def _plain(array: Any) -> Any:
 
 def _show(run: "Run", cost: dict[str, Any], out: Path | None) -> None:
     lines = [str(run.solution), f"  cost in the world that it makes: {said(cost)}; {run.seconds:.1f} s"]
+    lines += _policy(run.problem, run.solution.M)
     lines += verdicts(run.certificates)
     if out is not None:
         lines.append(f"kept in {out}: perfcontrol simulate {out}, or pc.load({str(out)!r})")
     for line in lines:
         console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+
+def _policy(problem: Any, M: Any) -> list[str]:
+    """The policy in numbers, a line for each lag and input, where that is not too long."""
+    import numpy as np
+
+    policy = np.asarray(M)
+    if policy[..., 0].size > ROWS or policy.shape[-1] > COLUMNS:
+        return []
+    named = problem.policy_shape == problem.lifted_shape
+    inputs = (problem.system.input_names if named else None) or [f"u{i}" for i in range(policy.shape[1])]
+    states = (problem.system.state_names if named else None) or [f"x{i}" for i in range(policy.shape[2])]
+    width = max(10, *(len(name) + 2 for name in states))
+    front = max(len(name) for name in inputs) + 9
+    lines = ["policy: input by the noise of each state" + ", free parameters" * (not named)]
+    lines.append(" " * (2 + front) + "".join(f"{name:>{width}}" for name in states))
+    for lag, rows in enumerate(policy, start=1):
+        for name, row in zip(inputs, rows, strict=True):
+            lines.append(f"  {f'lag {lag}, {name}':<{front}}" + "".join(f"{value:>{width}.4g}" for value in row))
+    return lines
 
 
 def said(cost: dict[str, Any]) -> str:

@@ -116,7 +116,8 @@ def _show(rows: list[dict[str, Any]], axes: dict[str, list[Any]], folder: Path) 
         numbers = row["numbers"]
         cells = [shown(numbers.get(name)) for name in ("cost", "steps", "seconds")]
         ended = "ended as asked" if numbers["success"] else row["result"].split(":")[0]
-        table.add_row(*(str(value) for value in row["point"].values()), *cells, ended)
+        values = [f"{value:g}" if isinstance(value, float) else str(value) for value in row["point"].values()]
+        table.add_row(*values, *cells, ended)
     console.print(table)
     more = f" ({len(rows) - SHOWN} more rows there)" if len(rows) > SHOWN else ""
     line = f"{len(rows)} points in {folder}{more}: pc.load({str(folder)!r}) is an xarray Dataset"
