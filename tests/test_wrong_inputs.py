@@ -135,7 +135,7 @@ MAPS = {  # what fails inside a user's own function: the argument it was passed 
 @pytest.mark.parametrize("case", MAPS)
 def test_error_inside_a_function_of_the_user_says_which_one_with_what_it_was_given_and_its_cause(case):
     call, name, *words = MAPS[case]
-    assert_refused(call, name, "KeyError from it", "'prices'", "Its own error stands above", *words)
+    assert_refused(call, name, "KeyError from it", "'prices'", "its own error stands above", *words)
     with pytest.raises(pc.InputError) as caught:
         call()
     assert isinstance(caught.value.__cause__, KeyError)

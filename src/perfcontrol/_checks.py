@@ -24,6 +24,8 @@ _warned_about_precision = False
 
 def fail(name: str, got: str, required: str, remedy: str) -> InputError:
     """The error that every check raises: "`name` must ...; got ... Remedy." """
+    first, *rest = got.splitlines() or [got]
+    got = f"{first} ..." if rest else got  # an array printed on several lines
     return InputError(f"`{name}` must {required}; got {got}. {remedy}")
 
 
@@ -257,5 +259,5 @@ def as_names(argument: str, names: Any, count: int) -> tuple[str, ...] | None:
         return None
     names = (names,) if isinstance(names, str) else tuple(names)
     if len(names) != count or len(set(names)) < count or not all(isinstance(name, str) for name in names):
-        raise fail(argument, f"{list(names)}", f"be {count} different names", "One text for each signal.")
+        raise fail(argument, f"{list(names)}", f"be {count} different names", "Pass one text for each signal.")
     return names

@@ -47,7 +47,7 @@ def call(name: str, function: Callable, /, **arguments: Any) -> Any:
             name,
             " ".join(f"{type(error).__name__} from it: {error}".split("\n")[0].split()).rstrip(".: "),
             f"accept {given}",
-            lifted + (remedy if traced else "Its own error stands above this one."),
+            lifted + (remedy if traced else "Correct it: its own error stands above this one."),
         ) from error
 
 

@@ -31,7 +31,7 @@ class DisturbanceAction(eqx.Module):
             raise fail("M", f"{self.M.shape}", "be a full policy of shape (H, m, n)", "Add the lag axis: M[None].")
         if self.gain.shape[-2:] != self.M.shape[1:] or self.gain.ndim not in (2, 3):
             required = f"have shape (m, n) = {self.M.shape[1:]}, or (T+1, m, n)"
-            raise fail("gain", f"{self.gain.shape}", required, "It fits M, (H, m, n).")
+            raise fail("gain", f"{self.gain.shape}", required, "Pass one that fits M, (H, m, n).")
 
     def init(self) -> Float[Array, "H n"]:
         """The empty memory: row i-1 holds w_{t-i}."""

@@ -121,7 +121,7 @@ class PerformativeProblem(Printed, eqx.Module):
                 "horizon",
                 str(self.horizon),
                 f"match the {system.horizon} time steps of the system",
-                "A_t and B_t are given for t = 0..horizon-1.",
+                f"Pass horizon={system.horizon}: A_t and B_t are given for t = 0..horizon-1.",
             )
         reacting_noise = callable(noise) and not isinstance(noise, AbstractRandomVector | type)
         self.noise = as_policy_map("noise", noise) if reacting_noise else fitted_vector("noise", noise, n, self.horizon)
@@ -276,7 +276,12 @@ class PerformativeProblem(Printed, eqx.Module):
 
 def _zero_gain(gain: Array, m: int, n: int) -> Array:
     if not isinstance(gain, jax.core.Tracer) and float(gain) != 0:
-        raise fail("gain", f"the number {float(gain)}", f"have shape (m, n) = ({m}, {n})", "Only 0 stands for none.")
+        raise fail(
+            "gain",
+            f"the number {float(gain)}",
+            f"have shape (m, n) = ({m}, {n})",
+            "Pass a matrix (m, n); only 0 stands for none.",
+        )
     return jnp.zeros((m, n), gain.dtype)
 
 

@@ -40,7 +40,7 @@ def simulate(
     from perfcontrol.evaluate import simulate as paths_of
 
     if out is not None and out.suffix != ".nc":
-        raise fail("out", f"{out}", "end in .nc", "NetCDF is what xarray opens.")
+        raise fail("out", f"{out}", "end in .nc", "Name it for example paths.nc: NetCDF is what xarray opens.")
     with in_words("read the problem and the policy"):
         plan = plan_in(file, settings, seed)
         M = _policy(policy, plan) if policy else _own(file, plan)

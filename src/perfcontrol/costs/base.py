@@ -35,7 +35,9 @@ def as_discount(value: Any) -> Array | None:
         return None
     discount = as_array("discount", value)
     if discount.ndim or (is_concrete(discount) and not 0 < float(discount) <= 1):
-        raise fail("discount", f"{value}", "be one number in (0, 1]", "Stage t counts discount^t; 1.0: all alike.")
+        raise fail(
+            "discount", f"{value}", "be one number in (0, 1]", "Pass for example 0.99: stage t counts discount^t."
+        )
     return discount
 
 

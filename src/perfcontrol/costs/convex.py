@@ -67,7 +67,7 @@ class ConvexCost(AbstractCost):
                 "strong_convexity",
                 f"{float(mu)}",
                 f"not exceed the smoothness {float(sigma)}",
-                "No function curves more than its gradient allows.",
+                "Lower it, or raise smoothness: no function curves more than its gradient allows.",
             )
 
     def check(self, state_size: int, input_size: int, horizon: int | float) -> None:
@@ -78,7 +78,9 @@ class ConvexCost(AbstractCost):
         value = jax.eval_shape(self._stage, t, x, u)
         if value.shape != () or not jnp.issubdtype(value.dtype, jnp.floating):
             got = f"{value.dtype} of shape {value.shape}"
-            raise fail("function", got, "return one real number", "Sum over the components of x and u.")
+            raise fail(
+                "function", got, "return one real number", "Return a scalar: sum over the components of x and u."
+            )
 
     def check_convexity(self, x: Float[Array, "S T1 n"], u: Float[Array, "S T1 m"]) -> None:
         """Raise InputError where the function is not convex, not smooth, or breaks a declared constant.

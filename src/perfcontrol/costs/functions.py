@@ -26,7 +26,12 @@ class AbstractStageFunction(eqx.Module):
         self.input_weight = as_array("input_weight", input_weight)
         for name, weight in (("state_weight", self.state_weight), ("input_weight", self.input_weight)):
             if weight.ndim > 1:
-                raise fail(name, f"{weight.shape}", "be a number or a vector", "One weight an entry; no matrix.")
+                raise fail(
+                    name,
+                    f"{weight.shape}",
+                    "be a number or a vector",
+                    "Pass one weight an entry: the diagonal of a matrix.",
+                )
             check_nonnegative(name, weight, "The stage cost must be convex.")
         self.state_target = None if state_target is None else as_array("state_target", state_target)
         self.input_target = None if input_target is None else as_array("input_target", input_target)
@@ -63,7 +68,12 @@ class AbstractStageFunction(eqx.Module):
 def _positive(name: str, value: Any) -> Array:
     number = as_array(name, value)
     if number.ndim or (is_concrete(number) and not float(number) > 0):
-        raise fail(name, f"{value}", "be one positive number", "A large one nears the square; weights scale entries.")
+        raise fail(
+            name,
+            f"{value}",
+            "be one positive number",
+            "Pass for example 1.0: a large one nears the square, and weights scale entries.",
+        )
     return number
 
 
@@ -169,7 +179,7 @@ class OneSidedQuadratic(AbstractStageFunction):
         input_target: Any = None,
     ):
         if side not in ("above", "below"):
-            raise fail("side", repr(side), 'be "above" or "below"', "It says which states cost.")
+            raise fail("side", repr(side), 'be "above" or "below"', 'Pass side="above" where large values cost.')
         self.side = side
         super().__init__(state_weight, input_weight, state_target, input_target)
 
@@ -209,7 +219,10 @@ class LinearExponential(AbstractStageFunction):
         self.risk = as_array("risk", risk)
         if self.risk.ndim > 1 or (is_concrete(self.risk) and not bool(jnp.all(self.risk != 0))):
             raise fail(
-                "risk", f"{risk}", "not be zero: a number, or one a state", "Risk near zero is pc.QuadraticCost."
+                "risk",
+                f"{risk}",
+                "not be zero: a number, or one a state",
+                "Use pc.QuadraticCost: the limit of risk zero.",
             )
         super().__init__(state_weight, input_weight, state_target, input_target)
 

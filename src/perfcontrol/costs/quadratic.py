@@ -61,7 +61,7 @@ class QuadraticCost(AbstractCost):
                     name,
                     f"{weight.shape}",
                     "be square: (n, n) or (T+1, n, n)",
-                    "A scalar weight needs [[q]].",
+                    "Pass [[q]] for a scalar weight.",
                 )
             check_symmetric_psd(name, weight, "The stage cost must be convex.")
         if self.cross is not None:
@@ -74,7 +74,7 @@ class QuadraticCost(AbstractCost):
                     "cross",
                     f"{self.cross.shape}",
                     f"have shape (n, m) = ({n}, {m})",
-                    swapped or "Rows: states.",
+                    swapped or "Put states in rows, inputs in columns.",
                 )
             weights = {"Q": self.Q, "R": self.R, "cross": self.cross}
             length = max(w.shape[0] if w.ndim == 3 else 1 for w in weights.values())

@@ -23,7 +23,12 @@ class Copies:
     def __init__(self, problem: PerformativeProblem | None, actions: str, regret: bool, count: int):
         self.problem = example() if problem is None else check_end(problem)
         if actions not in MODES:
-            raise fail("actions", repr(actions), f"be one of {MODES}", "Inputs u_t, or a policy for each episode.")
+            raise fail(
+                "actions",
+                repr(actions),
+                f"be one of {MODES}",
+                "Pass one of them: inputs u_t, or a policy for each episode.",
+            )
         self.actions, self.count = actions, count
         self.oracle = Oracle(self.problem) if regret else None
         self.announced = np.repeat(np.asarray(self.problem.initial_policy())[None], count, axis=0)

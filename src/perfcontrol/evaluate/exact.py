@@ -142,6 +142,6 @@ def expected_gradient(problem: PerformativeProblem, M: Any, *, deployed: Any = N
             "deployed",
             "a policy together with total=True",
             "be left out for the total gradient",
-            "The total derivative moves both policies together.",
+            "Leave it out: the total derivative moves both policies together.",
         )
     return check_answer("the total gradient", value_and_total_gradient(problem, M)[1], problem, M)

@@ -109,7 +109,7 @@ def investment_problem(
 ) -> PerformativeProblem:
     """Example 1 for any laws of the day's price ratios and of the risk w_t, of L stocks each; A = persistence I."""
     if not 0 < float(trading_hours) < 24:
-        raise fail("trading_hours", str(trading_hours), "lie between 0 and 24", "Hours per day.")
+        raise fail("trading_hours", str(trading_hours), "lie between 0 and 24", "Pass hours per day, such as 6.5.")
     exposure = float(trading_hours) / (24 - float(trading_hours))
     sets: dict[str, AbstractSet] = {"rows": RowSum(exposure), "simplex": RowSimplex(exposure)}
     if feasible_set not in sets:

@@ -41,7 +41,7 @@ def load(path: Any) -> Any:
     if path.suffix == ".npz":
         return read_solution(path)
     required = "end in .toml (a problem) or .npz (a solution), or be the folder of a run"
-    raise fail("path", f"{path}", required, "Rename it, or check the path.")
+    raise fail("path", f"{path}", required, 'Name such a file, for example "problem.toml".')
 
 
 def save(thing: Any, path: Any) -> None:
@@ -67,7 +67,7 @@ def save(thing: Any, path: Any) -> None:
         write_run(thing, path)
     else:
         required = "be a problem, a solution, or a run such as pc.Run(problem, solution)"
-        raise fail("thing", type(thing).__name__, required, "Arrays are saved with numpy.save.")
+        raise fail("thing", type(thing).__name__, required, "Save arrays with numpy.save.")
 
 
 def _path(path: Any) -> Path:

@@ -99,7 +99,7 @@ def read_npy(path: Path) -> np.ndarray:
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
     except FileNotFoundError:
-        raise fail("path", f"{path}, which does not exist", "be a file", "Check the path.") from None
+        raise fail("path", f"{path}, which does not exist", "be a file", "Name a file that exists.") from None
     except (OSError, ValueError, EOFError, SyntaxError, MemoryError, OverflowError, TypeError) as error:
         why = str(error).split("\n")[0][:120]
         raise fail("path", f"{path.name} ({why})", "be a NumPy file of numbers", remedy) from None

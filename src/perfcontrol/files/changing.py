@@ -15,7 +15,7 @@ def changed(document: Document, settings: list[str]) -> Document:
     for setting in settings:
         key, equals, text = setting.partition("=")
         if not equals or not key.strip():
-            raise fail("--set", repr(setting), "be key=value", "Write for example --set cost.discount=0.9")
+            raise fail("--set", repr(setting), "be key=value", "Write for example --set cost.discount=0.9.")
         values[key.strip()] = value_of(text.strip())
     return changed_at(document, values)
 
@@ -64,4 +64,9 @@ def put(tables: dict[str, Any], key: str, value: Any) -> None:
 
 
 def _no_such(key: str, part: str) -> InputError:
-    return fail("--set", f"{key}, where {part} is neither a table nor an element of a list", "name a key", "Mend it.")
+    return fail(
+        "--set",
+        f"{key}, where {part} is neither a table nor an element of a list",
+        "name a key",
+        "Write for example --set cost.discount=0.9.",
+    )

@@ -104,7 +104,7 @@ def _refused(path: Path) -> NoReturn:
         if path.exists()
         else "which does not exist"
     )
-    raise fail("path", f"{path}, {got}", "be a file", "Check the path.")
+    raise fail("path", f"{path}, {got}", "be a file", "Name one that exists; `perfcontrol new` writes a first one.")
 
 
 def parsed(text: str, name: str) -> dict[str, Any]:

@@ -157,7 +157,12 @@ def read_record(folder: Path) -> dict[str, Any]:
     """What is known of the run in a folder; raises InputError where there is none."""
     required = "be a folder that a run was kept in"
     if not (folder / RECORD).is_file():
-        raise fail("path", f"{folder}, without {RECORD}", required, "`perfcontrol solve FILE --out FOLDER` makes one.")
+        raise fail(
+            "path",
+            f"{folder}, without {RECORD}",
+            required,
+            "Run `perfcontrol solve FILE --out FOLDER`, which makes one.",
+        )
     try:
         record = json.loads(read_text(folder / RECORD, 2**20, ""))
         if record["format"] != FORMAT:

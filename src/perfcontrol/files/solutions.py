@@ -66,7 +66,9 @@ def read_solution(path: Path) -> Solution:
         history = _restored(header["history"], arrays)
         return Solution(_leaf(arrays["M"]), result, _leaf(arrays["steps"]), history, stats)
     except FileNotFoundError:
-        raise fail("path", f"{path}, which does not exist", "be a file", "Check the path.") from None
+        raise fail(
+            "path", f"{path}, which does not exist", "be a file", "Name a file that pc.save has written."
+        ) from None
     except (UnreadableError, KeyError, IndexError, TypeError, ValueError, AttributeError, RecursionError) as error:
         raise fail("path", f"{path} with {error}"[:300], "be a solution that pc.save wrote", "Save it again.") from None
 

@@ -28,14 +28,14 @@ def axis_of(text: str) -> tuple[str, list[Any]]:
     """A key and its values, from `key=1,2,3`, or `key=0:1:11` for eleven numbers from 0 to 1."""
     key, equals, values = text.partition("=")
     if not equals or not key.strip() or not values.strip():
-        raise fail("--vary", repr(text), "be key=value,value,...", "Write for example --vary noise.high=0.5,1,2")
+        raise fail("--vary", repr(text), "be key=value,value,...", "Write for example --vary noise.high=0.5,1,2.")
     ends = _RANGE.fullmatch(values)
     try:
         first, last, count = (float(ends[1]), float(ends[2]), int(ends[3])) if ends else (0.0, 0.0, 0)
     except ValueError:
         ends, first, last, count = None, 0.0, 0.0, 0
     if ends and not 2 <= count <= MOST:
-        raise fail("--vary", repr(text), f"have 2 to {MOST} numbers", "Write for example key=0:1:11")
+        raise fail("--vary", repr(text), f"have 2 to {MOST} numbers", "Write for example key=0:1:11.")
     if ends:
         return key.strip(), np.linspace(first, last, count).tolist()
     listed = value_of(f"[{values}]")

@@ -83,7 +83,7 @@ def decide(
 ) -> Decision:
     """See `Fit.decide`; `problem` is the fitted one."""
     if not (isinstance(level, int | float) and 0 < level < 1):
-        raise fail("level", repr(level), "be a number between 0 and 1", "0.95 is usual.")
+        raise fail("level", repr(level), "be a number between 0 and 1", "Pass for example level=0.95.")
     M = solve(problem, solver, key=key).M
     verdict = _certificate(problem, certificate, M)
     members = _members(ensemble)

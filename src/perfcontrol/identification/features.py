@@ -76,5 +76,5 @@ def features_of(name: str, reaction: Any, policies: np.ndarray) -> Features:
     key = str(reaction).replace("_", " ")
     if key not in known:
         required = f"be 'auto', a function of the policy, or one of {NAMES}"
-        raise fail(name, repr(reaction), required, "A dict sets 'mean' and 'scale' apart.")
+        raise fail(name, repr(reaction), required, "Pass one of them, or a dict that sets 'mean' and 'scale' apart.")
     return known[key]

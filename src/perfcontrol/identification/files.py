@@ -66,7 +66,12 @@ def _write_rows(path: Path, header: list[str], rows: Any) -> None:
 def from_csv(folder: Path) -> Contents:
     """What `Logs.from_csv` makes logs of."""
     if not folder.is_dir():
-        raise fail("folder", str(folder), "be a folder of logs", f"It holds {EPISODES}, {POLICIES} and the episodes.")
+        raise fail(
+            "folder",
+            str(folder),
+            "be a folder of logs",
+            f"Name one that holds {EPISODES}, {POLICIES} and the episodes.",
+        )
     names, index = _read(folder / EPISODES, ["file", "policy"], ["file"])
     text, table = _read(folder / POLICIES, ["policy", "lag", "input"], ["input"])
     policies = _policies(folder / POLICIES, table)
@@ -101,16 +106,21 @@ def _read(path: Path, required: list[str], text: list[str]) -> tuple[dict[str, l
     """The text columns by name, and all others as numbers; a blank is NaN."""
     name = path.name
     if not path.is_file():
-        raise fail(name, "no such file", "exist in the folder", f"Looked for {path}.")
+        raise fail(name, "no such file", "exist in the folder", f"Add it: looked for {path}.")
     with path.open(newline="", encoding="utf-8") as file:
         rows = [row for row in csv.reader(file) if row]
     header = [column.strip() for column in rows[0]] if rows else []
     missing = [column for column in required if column not in header]
     if missing:
-        raise fail(name, f"the header {header}", f"have the columns {required}", f"Missing: {', '.join(missing)}.")
+        raise fail(name, f"the header {header}", f"have the columns {required}", f"Add {', '.join(missing)}.")
     for line, row in enumerate(rows[1:], start=2):
         if len(row) != len(header):
-            raise fail(name, f"{len(row)} cells in line {line}", f"have {len(header)} cells a line", "Mend that line.")
+            raise fail(
+                name,
+                f"{len(row)} cells in line {line}",
+                f"have {len(header)} cells a line",
+                "Give that line as many cells as the header.",
+            )
     labels = {column: [row[header.index(column)] for row in rows[1:]] for column in text}
     numeric = [column for column in header if column not in text]
     numbers = np.empty((len(rows) - 1, len(numeric)))
@@ -120,7 +130,12 @@ def _read(path: Path, required: list[str], text: list[str]) -> tuple[dict[str, l
             try:
                 numbers[i, j] = float(cell) if cell else np.nan
             except ValueError as error:
-                raise fail(name, f"{cell!r} in line {i + 2}, column {column}", "hold numbers", "Mend it.") from error
+                raise fail(
+                    name,
+                    f"{cell!r} in line {i + 2}, column {column}",
+                    "hold numbers",
+                    "Write a number there, such as 0.5.",
+                ) from error
     return labels, numbers
 
 
@@ -133,7 +148,7 @@ def _policies(path: Path, table: np.ndarray) -> dict[float, np.ndarray]:
         count = int(np.sum(lags == 1))
         if count == 0 or not np.array_equal(lags, np.repeat(np.arange(1, len(rows) // count + 1), count)):
             got = f"lags {lags.tolist()} of policy {policy:g}"
-            raise fail(path.name, got, "list lag 1, 2, ... with every input", "One row for each lag and input.")
+            raise fail(path.name, got, "list lag 1, 2, ... with every input", "Write one row for each lag and input.")
         found[policy] = rows[:, 2:].reshape(-1, count, rows.shape[1] - 2)
     return found
 
@@ -184,7 +199,12 @@ def from_dataset(dataset: Any) -> Contents:
     """What `Logs.from_dataset` makes logs of."""
     missing = [name for name in ("x", "u", "deployed") if name not in dataset]
     if missing:
-        raise fail("dataset", f"no {', '.join(missing)}", "hold x, u and deployed", "See Logs.to_dataset.")
+        raise fail(
+            "dataset",
+            f"no {', '.join(missing)}",
+            "hold x, u and deployed",
+            "Name its variables as `Logs.to_dataset` does.",
+        )
     axes = {
         "x": ("episode", "time", "state"),
         "u": ("episode", "time", "input"),

@@ -79,7 +79,7 @@ def check_directions(directions: Any, data: Transitions) -> np.ndarray:
     array = np.asarray(directions, dtype=float)
     if array.ndim != 3 or array.shape[1] != n or array.shape[2] not in (n, n + m):
         required = f"have shape (k, n, n) = (k, {n}, {n}), or (k, {n}, {n + m}) to act on [x; u]"
-        raise fail("directions", f"{array.shape}", required, "A single direction D is passed as [D].")
+        raise fail("directions", f"{array.shape}", required, "Pass a single direction D as [D].")
     if not np.all(np.isfinite(array)) or np.any(np.all(array == 0, axis=(1, 2))):
         raise fail("directions", "a zero or non-finite matrix", "be finite and nonzero", "Leave it out.")
     return array

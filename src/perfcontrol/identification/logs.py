@@ -56,7 +56,7 @@ class Logs(eqx.Module):
             deployed = np.broadcast_to(deployed, (len(self.x), *deployed.shape))
         if deployed.ndim != 4 or deployed.shape[0] != len(self.x) or deployed.shape[1] < 1:
             required = f"have shape (episodes, memory, m, n) = ({len(self.x)}, memory, {m}, {n})"
-            raise fail("deployed", f"{deployed.shape}", required, "One policy (memory, m, n) for each episode.")
+            raise fail("deployed", f"{deployed.shape}", required, "Pass one policy (memory, m, n) for each episode.")
         if deployed.shape[2:] != (m, n):
             swapped = deployed.shape[2:] == (n, m)
             hint = "The last two axes look swapped." if swapped else "A policy maps the noise (n) to the input (m)."
@@ -68,7 +68,12 @@ class Logs(eqx.Module):
         shared = set(self.state_names or ()) & set(self.input_names or ())
         if shared:
             required = "be none of the states"
-            raise fail("input_names", f"{sorted(shared)}, which are states", required, "A signal is one or the other.")
+            raise fail(
+                "input_names",
+                f"{sorted(shared)}, which are states",
+                required,
+                "Rename one of them: a signal is one or the other.",
+            )
 
     @classmethod
     def simulate(cls, problem: PerformativeProblem, policies: Any, key: Any, episodes: int) -> "Logs":
@@ -188,7 +193,7 @@ def _episodes(name: str, value: Any, labels: str) -> tuple[np.ndarray, ...]:
     else:
         episodes = tuple(_numbers(f"{name}[{e}]", episode) for e, episode in enumerate(value))
     if not episodes:
-        raise fail(name, "no episode", "hold at least one episode", "Nothing can be said about nothing.")
+        raise fail(name, "no episode", "hold at least one episode", "Pass at least one episode.")
     return episodes
 
 
@@ -196,12 +201,17 @@ def _check_episode(e: int, states: np.ndarray, inputs: np.ndarray, n: int, m: in
     for name, array, size in (("x", states, n), ("u", inputs, m)):
         if array.ndim != 2 or array.shape[1] != size or size == 0:
             required = f"have shape (time, {size})"
-            raise fail(f"{name}[{e}]", f"{array.shape}", required, "The same signals in every episode.")
+            raise fail(f"{name}[{e}]", f"{array.shape}", required, "Log the same signals in every episode.")
     if len(states) < 2:
         raise fail(f"x[{e}]", f"{len(states)} times", "cover at least one transition", "Leave this episode out.")
     if len(inputs) not in (len(states) - 1, len(states)):
         required = f"have {len(states) - 1} or {len(states)} times: x has {len(states)}"
-        raise fail(f"u[{e}]", f"{len(inputs)}", required, "u_t is the input applied at x_t.")
+        raise fail(
+            f"u[{e}]",
+            f"{len(inputs)}",
+            required,
+            "Pass one input for each state, or for each but the last: u_t is applied at x_t.",
+        )
 
 
 def _grouped(deployed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -215,5 +225,10 @@ def _common(one: Logs, other: Logs, kind: str) -> tuple[str, ...] | None:
     """The names that two logs share; those of the other where one has none."""
     first, second = getattr(one, kind), getattr(other, kind)
     if first is not None and second is not None and first != second:
-        raise fail(kind, f"{list(first)} and {list(second)}", "be the same in both logs", "Reorder one of them.")
+        raise fail(
+            kind,
+            f"{list(first)} and {list(second)}",
+            "be the same in both logs",
+            "Put one of them into the order of the other.",
+        )
     return first or second

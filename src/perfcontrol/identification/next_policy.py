@@ -34,14 +34,14 @@ def _checked(candidates: Any, shape: tuple[int, ...]) -> np.ndarray:
     array = np.asarray(candidates, dtype=float)
     if array.ndim != 4 or array.shape[1:] != shape or len(array) == 0 or not np.all(np.isfinite(array)):
         required = f"be finite policies of shape {shape}, stacked"
-        raise fail("candidates", f"{array.shape}", required, "A single one is passed as [M].")
+        raise fail("candidates", f"{array.shape}", required, "Pass a single one as [M].")
     return array
 
 
 def _radius(data: Transitions, common: Common, radius: float | None) -> float:
     if radius is not None:
         if not (isinstance(radius, int | float) and 0 < radius < np.inf):
-            raise fail("radius", repr(radius), "be a positive number", "None takes the spread of those deployed.")
+            raise fail("radius", repr(radius), "be a positive number", "Pass None for the spread of those deployed.")
         return float(radius)
     flat = data.policies.reshape(len(data.policies), -1)
     spread = float(np.linalg.norm(flat[:, None] - flat[None], axis=2).max())

@@ -27,7 +27,7 @@ class Parameter(Estimate):
             level: how often it should hold the truth.
         """
         if not (isinstance(level, int | float) and 0 < level < 1):
-            raise fail("level", repr(level), "be a number between 0 and 1", "0.95 is usual.")
+            raise fail("level", repr(level), "be a number between 0 and 1", "Pass for example level=0.95.")
         degrees = np.minimum(np.asarray(self.degrees_of_freedom, dtype=float), 1e9)
         reach = special.stdtrit(degrees, (1 + level) / 2) * np.asarray(self.standard_error, dtype=float)
         mean = np.asarray(self.mean, dtype=float)

@@ -100,7 +100,7 @@ def _gains(gain: Any, m: int, n: int, length: int) -> np.ndarray:
         hint = "The last two axes look swapped." if gains.shape[-2:] == (n, m) else "The sign is u = -K x + ..."
         raise fail("gain", f"{gains.shape}", f"have shape (m, n) = ({m}, {n}), or (T+1, {m}, {n})", hint)
     if not np.all(np.isfinite(gains)):
-        raise fail("gain", "an infinite or missing entry", "have finite entries only", "See pc.design_gain.")
+        raise fail("gain", "an infinite or missing entry", "have finite entries only", "Pass one of pc.design_gain.")
     return gains
 
 

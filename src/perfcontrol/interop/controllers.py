@@ -51,7 +51,12 @@ def to_control(
         raise fail("noise", repr(noise), 'be "given" or "recovered"', "Pass one of these names.")
     memory, m, n = policy.shape
     if problem.has_gain and problem.gain.ndim == 3:
-        raise fail("problem", "a gain K_t that varies in time", "have a constant gain", "A StateSpace has none other.")
+        raise fail(
+            "problem",
+            "a gain K_t that varies in time",
+            "have a constant gain",
+            "Build the problem with one gain (m, n): a StateSpace has none other.",
+        )
     K = np.asarray(problem.gain, dtype=float)
     names = problem.system
     states = list(names.state_names or (f"x[{i}]" for i in range(n)))

@@ -42,12 +42,15 @@ def from_control(sys: Any) -> LinearSystem:
         plant: Any = sys if kind.__name__ == "StateSpace" else control.ss(sys)
         return _system(plant.A, plant.B, plant.state_labels, plant.input_labels)
     required = "be a control.StateSpace, a control.TransferFunction or a scipy.signal.dlti"
-    raise fail("sys", "None" if sys is None else kind.__name__, required, "Or use pc.LinearSystem(A, B).")
+    raise fail("sys", "None" if sys is None else kind.__name__, required, "Use pc.LinearSystem(A, B) for matrices.")
 
 
 def _system(A: Any, B: Any, states: Any, inputs: Any) -> LinearSystem:
     if np.size(A) == 0:
         raise fail(
-            "sys", "a gain without state", "have at least one state", "A static gain needs no control over time."
+            "sys",
+            "a gain without state",
+            "have at least one state",
+            "Pass a plant with states: a static gain needs no control over time.",
         )
     return LinearSystem(A, B, state_names=states, input_names=inputs)

@@ -152,7 +152,7 @@ class Controller:
                 "state",
                 f"{int(progress.t)} observed steps",
                 f"have seen the {self._finite.horizon} of an episode",
-                "To leave an episode out, go on from the state before it.",
+                "Call observe for each step; to leave an episode out, go on from the state before it.",
             )
         kept = int(progress.kept) + 1
         cost = float(costs(self._finite, state.deployed, progress.episodes)[kept - 1])

@@ -50,7 +50,7 @@ class Gate:
                 raise fail(name, repr(value), "be a positive number", "Pass None to look away.")
         for name in ("step", "certificate"):
             if not isinstance(getattr(self, name), bool):
-                raise fail(name, repr(getattr(self, name)), "be True or False", "False leaves this check out.")
+                raise fail(name, repr(getattr(self, name)), "be True or False", "Pass False to leave this check out.")
 
     def check(self, problem: PerformativeProblem, solver: RSGD) -> None:
         """Raise where the model does not tell what this gate asks for."""

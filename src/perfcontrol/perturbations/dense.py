@@ -118,7 +118,7 @@ class DensePerturbation(AbstractPerturbation):
                 "law",
                 f"dimension {self.law.size}",
                 f"have dimension n p = {n * p}",
-                f"One entry per entry of the {n} x {p} matrix; `on_input` decides p.",
+                f"Pass a law with one entry per entry of the {n} x {p} matrix; `on_input` decides p.",
             )
 
     def _shape(self, M: Array) -> tuple[int, int]:

@@ -31,5 +31,5 @@ def check_values(
             name,
             f"values of shape {shape}",
             "have values of shape " + " or ".join(map(str, allowed)),
-            "The time axis comes first.",
+            "Return such an array: the time axis comes first.",
         )

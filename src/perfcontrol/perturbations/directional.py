@@ -97,7 +97,7 @@ class DirectionalPerturbation(AbstractPerturbation):
                 "directions",
                 f"{self.directions.shape}",
                 "have shape (k, n, n) or (k, n, n+m)",
-                "A single direction D is passed as [D].",
+                "Pass a single direction D as [D].",
             )
         if law not in SCALAR_LAWS:
             raise fail("law", repr(law), f"be one of {sorted(SCALAR_LAWS)}", "Pass one of these names.")
@@ -116,7 +116,7 @@ class DirectionalPerturbation(AbstractPerturbation):
                 "directions",
                 f"{self.directions.shape}",
                 f"have shape (k, n, n) = ({count}, {n}, {n}) or (k, n, n+m) = ({count}, {n}, {n + m})",
-                "n and m come from the system.",
+                "Pass matrices of that size: n and m come from the system.",
             )
         dtype = self.directions.dtype
         check_values("scale", self.scale, policy_shape, [(horizon, count), (count,)], dtype)

@@ -83,7 +83,7 @@ class FinitePerturbation(AbstractPerturbation):
         self.values = as_array("values", values)
         if self.values.ndim not in (3, 4):
             required = "have shape (k, n, p) or (T, k, n, p)"
-            raise fail("values", f"{self.values.shape}", required, "A single matrix V is passed as [V].")
+            raise fail("values", f"{self.values.shape}", required, "Pass a single matrix V as [V].")
         self.probabilities = as_policy_map("probabilities", probabilities)
         if not isinstance(self.probabilities, ConstantMap) or not is_concrete(constant := self.probabilities.value):
             return
@@ -107,7 +107,7 @@ class FinitePerturbation(AbstractPerturbation):
                 "values",
                 f"{self.values.shape}",
                 f"have shape (k, n, p) = ({k}, {n}, {n} or {n + m}), or ({horizon}, {k}, ...) where they vary in time",
-                "n and m come from the system.",
+                "Pass matrices of that size: n and m come from the system.",
             )
         check_values("probabilities", self.probabilities, policy_shape, [(horizon, k), (k,)], self.values.dtype)
 

@@ -63,11 +63,16 @@ class SampledPerturbation(AbstractPerturbation):
                 "sampler",
                 f"draws of shape {shape}",
                 f"draw arrays of shape (T, n, n) = {(horizon, n, n)} or (T, n, n+m) = {(horizon, n, n + m)}",
-                "The time axis comes first.",
+                "Return such an array: the time axis comes first.",
             )
         for name, value in (("bound", self.declared_bound), ("sensitivity", self.declared_sensitivity)):
             if value is not None and value.shape not in ((), (horizon,)):
-                raise fail(name, f"{value.shape}", f"be a number or have shape (T,) = ({horizon},)", "One per step.")
+                raise fail(
+                    name,
+                    f"{value.shape}",
+                    f"be a number or have shape (T,) = ({horizon},)",
+                    "Pass one per step, or one for all.",
+                )
 
     def sample(self, key: Key[Array, ""], M: Array, horizon: int) -> Draws:
         return DenseDraws(self._draw(key, M).astype(M.dtype))

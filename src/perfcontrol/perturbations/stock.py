@@ -97,7 +97,12 @@ class StockPerturbation(AbstractPerturbation):
     def resize(self, policy_shape: tuple[int, int, int], horizon: int) -> "StockPerturbation":
         _, m, n = policy_shape
         if m != n or n % 2:
-            raise fail("perturbation", f"m, n = {m}, {n}", "have m = n = 2L", "The state is [r; q] of L stocks.")
+            raise fail(
+                "perturbation",
+                f"m, n = {m}, {n}",
+                "have m = n = 2L",
+                "Use a system whose state is [r; q] of L stocks, as pc.experiments.stock_market builds it.",
+            )
         return StockPerturbation(fitted_vector("growth", self.growth, n // 2, horizon), self.exposure)
 
     def portfolio(self, M: Array) -> Array:

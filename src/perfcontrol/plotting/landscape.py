@@ -72,7 +72,7 @@ def landscape(problem: PerformativeProblem, price: PriceOfStability) -> Landscap
             "problem",
             "one where both are the same",
             "have a stable policy that is not the optimal one",
-            "There is nothing to draw between them: print pc.price_of_stability(problem).",
+            "Print pc.price_of_stability(problem): there is nothing to draw between them.",
         )
     offset = price.naive - stable
     shift = float(np.sum(offset * along) / length**2)

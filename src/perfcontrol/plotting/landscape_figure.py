@@ -121,7 +121,12 @@ def draw_view(axes: Axes, price: PriceOfStability, found: Landscape, view: str) 
         _plane(axes, price, found, _levels(price, found))
     else:
         got = "policies on one line"
-        raise fail("view", f"'plane' of {got}", "be 'worlds' or 'line' here", "There is no plane of the three.")
+        raise fail(
+            "view",
+            f"'plane' of {got}",
+            "be 'worlds' or 'line' here",
+            "Pass view='line': there is no plane of the three.",
+        )
     return axes
 
 

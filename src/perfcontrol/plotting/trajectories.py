@@ -47,7 +47,12 @@ def plot_trajectories(
         InputError: as `pc.simulate`; unknown signals; another number of axes; a band outside (0, 1).
     """
     if not 0 < band < 1:
-        raise fail("band", f"{band}", "lie between 0 and 1", "0.9 leaves a twentieth of the paths out on either side.")
+        raise fail(
+            "band",
+            f"{band}",
+            "lie between 0 and 1",
+            "Pass for example 0.9, which leaves a twentieth of the paths out on either side.",
+        )
     paths = as_paths(problem, policies, key, samples, truncation)
     chosen = chosen_signals(problem, paths, signals)
     styles = looks(paths)

@@ -28,7 +28,7 @@ class Affine(AbstractPolicyMap):
                 "slope",
                 f"{self.slope.shape}",
                 f"have shape offset.shape + (memory, input, state) = {self.offset.shape} + (H, m, n)",
-                "The three policy axes come last.",
+                "Put the three policy axes last.",
             )
 
     def __call__(self, M: Array) -> Array:

@@ -37,11 +37,11 @@ class Norm(AbstractPolicyMap):
             self.offset, self.weight = jnp.broadcast_arrays(offset, weight)
         except ValueError as error:
             required = f"broadcast against `offset` of shape {offset.shape}"
-            raise fail("weight", f"{weight.shape}", required, "One weight per entry, or one for all.") from error
+            raise fail("weight", f"{weight.shape}", required, "Pass one weight per entry, or one for all.") from error
         self.center = None if center is None else as_array("center", center)
         if self.center is not None and self.center.ndim != 3:
             required = "have shape (memory, input, state)"
-            raise fail("center", f"{self.center.shape}", required, "It is a lifted policy; None is zero.")
+            raise fail("center", f"{self.center.shape}", required, "Pass a lifted policy, or None for zero.")
         self.squared = bool(squared)
 
     def __call__(self, M: Array) -> Array:

@@ -25,7 +25,7 @@ def paired(first_name: str, first: Any, second_name: str, second: Any) -> tuple[
     one, two = as_array(first_name, first), as_array(second_name, second)
     for name, value in ((first_name, one), (second_name, two)):
         if value.ndim > 1:
-            raise fail(name, f"{value.shape}", "be a vector (n,) or a number", "One entry per component.")
+            raise fail(name, f"{value.shape}", "be a vector (n,) or a number", "Pass one entry per component.")
     try:
         shape = jnp.broadcast_shapes(one.shape, two.shape)
     except ValueError as error:

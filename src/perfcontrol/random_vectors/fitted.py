@@ -15,7 +15,7 @@ def fitted_vector(name: str, law: Any, size: int, horizon: int | float) -> Abstr
     law = check_instance(name, law, AbstractRandomVector, example)
     law = law.resize(size)
     if law.size != size:
-        raise fail(name, f"dimension {law.size}", f"have dimension n = {size}", "One entry per state.")
+        raise fail(name, f"dimension {law.size}", f"have dimension n = {size}", "Pass one entry per state.")
     if math.isinf(horizon) and (law.mean.ndim == 2 or law.covariance.ndim == 3):
         raise varies(name, f"a law for {law.mean.shape[0]} time steps")
     if law.mean.ndim == 2 and law.mean.shape[0] != horizon:
@@ -23,6 +23,6 @@ def fitted_vector(name: str, law: Any, size: int, horizon: int | float) -> Abstr
             name,
             f"{law.mean.shape[0]} time steps",
             f"cover the horizon of {horizon} steps",
-            "One row for each t = 0..horizon-1.",
+            "Pass one row for each t = 0..horizon-1.",
         )
     return law

@@ -48,7 +48,7 @@ def mean_and_covariance(mean: Any, covariance: Any) -> tuple[Array, Array]:
     """Mean (n,) and covariance (n, n), checked and of one precision."""
     centre, spread = as_array("mean", mean), as_array("covariance", covariance)
     if centre.ndim != 1:
-        raise fail("mean", f"{centre.shape}", "be a vector (n,)", "One entry per component.")
+        raise fail("mean", f"{centre.shape}", "be a vector (n,)", "Pass one entry per component.")
     size = centre.shape[0]
     check_shape("covariance", spread, (size, size), ("n", "n"))
     check_symmetric_psd("covariance", spread, "A covariance has no negative eigenvalue.")

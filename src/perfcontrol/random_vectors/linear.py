@@ -25,7 +25,7 @@ class Linear(AbstractRandomVector):
     def __init__(self, law: AbstractRandomVector, matrix: Any, offset: Any = 0):
         self.matrix = as_array("matrix", matrix)
         if self.matrix.ndim != 2:
-            raise fail("matrix", f"{self.matrix.shape}", "have shape (n, k)", "One row per output component.")
+            raise fail("matrix", f"{self.matrix.shape}", "have shape (n, k)", "Pass one row per output component.")
         example = "pc.Gaussian(mean, covariance)"
         self.law = check_instance("law", law, AbstractRandomVector, example).resize(self.matrix.shape[1])
         if self.law.size != self.matrix.shape[1]:
@@ -33,7 +33,7 @@ class Linear(AbstractRandomVector):
                 "matrix",
                 f"{self.matrix.shape}",
                 f"have {self.law.size} columns, the law's size",
-                "Check the law.",
+                f"Pass matrix of shape (d, {self.law.size}), or another law.",
             )
         offset = as_array("offset", offset)
         self.offset = jnp.broadcast_to(offset, (self.matrix.shape[0],)) if offset.ndim == 0 else offset

@@ -31,15 +31,22 @@ class LogNormal(AbstractRandomVector):
     def __init__(self, mean: Any, covariance: Any):
         centre, spread = as_array("mean", mean), as_array("covariance", covariance)
         if centre.ndim not in (1, 2):
-            raise fail("mean", f"{centre.shape}", "have shape (n,) or (T, n)", "One entry per component.")
+            raise fail("mean", f"{centre.shape}", "have shape (n,) or (T, n)", "Pass one entry per component.")
         n, times = (
             centre.shape[-1],
             {array.shape[0] for array, fixed in ((centre, 1), (spread, 2)) if array.ndim > fixed},
         )
         if spread.ndim not in (2, 3) or spread.shape[-2:] != (n, n):
-            raise fail("covariance", f"{spread.shape}", f"have shape {(n, n)} or (T, {n}, {n})", "It fits the mean.")
+            raise fail(
+                "covariance", f"{spread.shape}", f"have shape {(n, n)} or (T, {n}, {n})", "Pass one that fits the mean."
+            )
         if len(times) == 2:
-            raise fail("covariance", f"{spread.shape[0]} times", f"have as many as the mean, {centre.shape[0]}", "T.")
+            raise fail(
+                "covariance",
+                f"{spread.shape[0]} times",
+                f"have as many as the mean, {centre.shape[0]}",
+                "Give both the same times, or one of them none.",
+            )
         check_symmetric_psd("covariance", spread, "A covariance has no negative eigenvalue.")
         self.log_mean = jnp.broadcast_to(centre, (*times, n))
         self.log_covariance = jnp.broadcast_to(spread, (*times, n, n))

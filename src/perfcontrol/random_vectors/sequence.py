@@ -21,7 +21,7 @@ class Sequence(AbstractRandomVector):
     def __init__(self, values: Any):
         self.values = as_array("values", values)
         if self.values.ndim != 2:
-            raise fail("values", f"{self.values.shape}", "have shape (time, n)", "One row per time step.")
+            raise fail("values", f"{self.values.shape}", "have shape (time, n)", "Pass one row per time step.")
 
     @property
     def mean(self) -> Array:

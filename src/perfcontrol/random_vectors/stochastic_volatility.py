@@ -77,7 +77,7 @@ class StochasticVolatility(AbstractRandomVector):
     def __init__(self, sensitivities: Any, rate: Any, volatility: str = "lognormal", stocks: int | None = None):
         self.sensitivities = sensitivities = as_array("sensitivities", sensitivities)
         if sensitivities.ndim != 1 or (is_concrete(sensitivities) and np.any(np.asarray(sensitivities) <= 0)):
-            raise fail("sensitivities", f"{sensitivities.shape}", "be positive numbers (T,)", "One per day.")
+            raise fail("sensitivities", f"{sensitivities.shape}", "be positive numbers (T,)", "Pass one per day.")
         if volatility not in VOLATILITIES:
             raise fail("volatility", repr(volatility), f"be one of {VOLATILITIES}", "Pass one of these names.")
         self.rate = as_array("rate", rate)

@@ -45,7 +45,7 @@ class Box(AbstractSet):
                     name,
                     f"{limit.shape}",
                     f"be a number or have shape (memory, input, state) = {shape}",
-                    "One bound per free parameter.",
+                    "Pass one bound per free parameter.",
                 )
 
     def project(self, M: Array) -> Array:

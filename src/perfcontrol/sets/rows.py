@@ -24,7 +24,7 @@ class _Rows(AbstractSet):
                 "total",
                 f"{self.total.shape}",
                 f"be a number or have shape (memory, input) = {shape[:-1]}",
-                "One sum per row of each lag of the free parameters.",
+                "Pass one sum per row of each lag of the free parameters.",
             )
 
 

@@ -26,14 +26,16 @@ class Support(AbstractSet):
         host = np.asarray(mask)
         if host.dtype != bool:
             if host.dtype.kind not in "iuf" or not np.isin(host, (0, 1)).all():
-                raise fail("mask", f"dtype {host.dtype}", "hold True and False", "True marks the free entries.")
+                raise fail(
+                    "mask", f"dtype {host.dtype}", "hold True and False", "Pass booleans: True marks the free entries."
+                )
             host = host.astype(bool)
         if host.ndim not in (2, 3):
             raise fail(
                 "mask",
                 f"{host.shape}",
                 "have shape (memory, input, state) or (input, state)",
-                "One entry per free parameter.",
+                "Pass one entry per free parameter.",
             )
         self.mask = jnp.asarray(host)
 
@@ -43,7 +45,7 @@ class Support(AbstractSet):
                 "mask",
                 f"{self.mask.shape}",
                 f"have shape (memory, input, state) = {shape} or (input, state) = {shape[1:]}",
-                "One entry per free parameter.",
+                "Pass one entry per free parameter.",
             )
 
     def project(self, M: Array) -> Array:

@@ -64,9 +64,19 @@ class Average(eqx.Module):
 
     def __init__(self, burn_in: float = 0.25, covariance: str | None = None):
         if not (isinstance(burn_in, int | float) and 0 <= burn_in < 1):
-            raise fail("burn_in", str(burn_in), "be a fraction in [0, 1)", "0.25 leaves out the first quarter.")
+            raise fail(
+                "burn_in",
+                str(burn_in),
+                "be a fraction in [0, 1)",
+                "Pass for example 0.25, which leaves out the first quarter.",
+            )
         if covariance is not None and covariance not in COVARIANCES:
-            raise fail("covariance", repr(covariance), f"be one of {COVARIANCES} or None", "None chooses.")
+            raise fail(
+                "covariance",
+                repr(covariance),
+                f"be one of {COVARIANCES} or None",
+                "Pass None to let the problem choose.",
+            )
         self.burn_in, self.covariance = float(burn_in), covariance
 
     def exact(self, problem: PerformativeProblem) -> bool:
@@ -80,7 +90,7 @@ class Average(eqx.Module):
                 "covariance",
                 "'sandwich' on a problem without exact derivatives",
                 "be 'batch means' where the cost is not quadratic or moments are unknown",
-                "Or pass None, which chooses.",
+                "Pass None, which chooses.",
             )
         shortest = 1 if self.exact(problem) else 2 * batches(problem)
         if steps - self.first(steps) < shortest:

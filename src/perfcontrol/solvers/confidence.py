@@ -90,7 +90,10 @@ def confidence_region(solution: Solution, level: float = 0.95) -> ConfidenceRegi
         raise fail("solution", f"a stack of {covariance.shape[:-2]} runs", "be of one run", "Take them one by one.")
     if solution.result != Result.success:
         raise fail(
-            "solution", f"a run that ended otherwise: {Result[solution.result]}", "have succeeded", "Mend it first."
+            "solution",
+            f"a run that ended otherwise: {Result[solution.result]}",
+            "have succeeded",
+            "Solve again until .result is success.",
         )
     averaged, clipped, batches = (int(stats[name]) for name in ("averaged", "clipped", "batches"))
     alike = float(stats["batch_correlation"])
@@ -99,7 +102,7 @@ def confidence_region(solution: Solution, level: float = 0.95) -> ConfidenceRegi
             "solution",
             f"a run in which the feasible set cut {clipped} of {averaged} averaged steps short",
             "average in the interior of the set, or on an affine one",
-            "At a border the error is not normal: use several seeds, or pc.StablePoint where moments are known.",
+            "Use several seeds, or pc.StablePoint where moments are known: at a border the error is not normal.",
         )
     values, vectors = np.linalg.eigh((covariance + covariance.T) / 2) if averaged else (np.full(1, np.nan), None)
     if not np.all(np.isfinite(values)) or vectors is None:

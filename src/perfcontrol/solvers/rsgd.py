@@ -92,7 +92,7 @@ class RSGD(AbstractSolver):
                 continue
             check_parentheses(name, part, f"be an object such as `{example}`")
             if not hasattr(part, ability):
-                raise fail(name, type(part).__name__, f"be an object such as `{example}`", "See the reference of RSGD.")
+                raise fail(name, type(part).__name__, f"be an object such as `{example}`", f"Pass {example}.")
         self.truncation = None if truncation is None else check_integer("truncation", truncation, 1)
         self.average = as_average(average)
         if self.average is not None and transform is not None:
@@ -100,7 +100,7 @@ class RSGD(AbstractSolver):
                 "transform",
                 "a gradient transformation together with average",
                 "be left out where iterates are averaged",
-                "The covariance of the average is that of plain steps.",
+                "Leave out one of them: the covariance of the average is that of plain steps.",
             )
 
     @property

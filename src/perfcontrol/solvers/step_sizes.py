@@ -30,7 +30,7 @@ class InverseStep(eqx.Module):
         self.phi1, self.phi2 = as_array("phi1", phi1), as_array("phi2", phi2)
         for name, value in (("phi1", self.phi1), ("phi2", self.phi2)):
             if is_concrete(value) and not (value.ndim == 0 and float(value) > 0):
-                raise fail(name, str(value), "be a positive number", "Theorem 1 needs both positive.")
+                raise fail(name, str(value), "be a positive number", "Pass a positive number: Theorem 1 needs both.")
 
     def __call__(self, n: Array) -> Array:
         return self.phi1 / (n + self.phi2)
@@ -92,7 +92,12 @@ class ConstantStep(eqx.Module):
     def __init__(self, size: Any):
         self.size = as_array("step_size", size)
         if is_concrete(self.size) and not (self.size.ndim == 0 and float(self.size) > 0):
-            raise fail("step_size", str(self.size), "be a positive number", "Or pass pc.InverseStep(phi1, phi2).")
+            raise fail(
+                "step_size",
+                str(self.size),
+                "be a positive number",
+                "Pass a positive number, or pc.InverseStep(phi1, phi2).",
+            )
 
     def __call__(self, n: Array) -> Array:
         return self.size

@@ -31,9 +31,14 @@ class LinearSystem(eqx.Module):
         self.A = A if isinstance(A, Diagonal) else as_array("A", A)
         self.B = B if isinstance(B, Diagonal) else as_array("B", B)
         if self.A.ndim not in (2, 3):
-            raise fail("A", f"{self.A.shape}", "have shape (n, n) or (T, n, n)", "A scalar system needs [[a]].")
+            raise fail("A", f"{self.A.shape}", "have shape (n, n) or (T, n, n)", "Pass [[a]] for a scalar system.")
         if self.B.ndim not in (2, 3):
-            raise fail("B", f"{self.B.shape}", "have shape (n, m) or (T, n, m)", "A single input needs a column.")
+            raise fail(
+                "B",
+                f"{self.B.shape}",
+                "have shape (n, m) or (T, n, m)",
+                "Pass a single input as a column, such as [[b1], [b2]].",
+            )
         n = self.A.shape[-1]
         check_shape("A", self.A, (*self.A.shape[:-2], n, n), ("time",) * (self.A.ndim - 2) + ("n", "n"))
         if self.B.shape[-2] != n:

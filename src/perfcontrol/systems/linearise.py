@@ -87,7 +87,10 @@ class Linearisation(eqx.Module):
         axes = as_array("radius", radius)
         if axes.shape not in ((), (size,)) or float(jnp.min(axes)) <= 0:
             raise fail(
-                "radius", f"{radius}", f"be positive, one number or {size}", "One half-axis a state, then inputs."
+                "radius",
+                f"{radius}",
+                f"be positive, one number or {size}",
+                "Pass one half-axis a state, then a half-axis an input.",
             )
         samples = check_integer("samples", samples, 2)
         direction_key, length_key = jax.random.split(check_key(key))
@@ -149,14 +152,21 @@ def linearise(f: Callable, state: Any, input: Any, policy: Any = None, tolerance
         arguments["M"] = _policy(policy, len(theta), len(Z)).astype(dtype)
     value = jnp.asarray(call("f", function, **arguments))
     if value.shape != Z.shape:
-        raise fail("f", f"a value of shape {value.shape}", f"give the next state, {Z.shape}", "One entry a state.")
+        raise fail(
+            "f", f"a value of shape {value.shape}", f"give the next state, {Z.shape}", "Return one entry a state."
+        )
 
     def of(*given: Array) -> Array:
         return jnp.asarray(call("f", function, **dict(zip(arguments, given, strict=True))), dtype)
 
     first, slopes = _derivatives(of, tuple(arguments.values()))
     if not all(bool(jnp.all(jnp.isfinite(array))) for array in (value, *first, *(slopes or ()))):
-        raise fail("f", "values or derivatives that are not finite", "be smooth at the equilibrium", "Check it there.")
+        raise fail(
+            "f",
+            "values or derivatives that are not finite",
+            "be smooth at the equilibrium",
+            "Evaluate f and jax.jacobian(f) there, and replace what divides by zero or takes the root of zero.",
+        )
     A, B = first[0], first[1]
     residual = value.astype(dtype) - Z
     limit = (1e-6 if dtype == jnp.float64 else 1e-4) if tolerance is None else tolerance
@@ -199,12 +209,14 @@ def _near(of: Callable, arguments: dict[str, Array]) -> str:
 def _vector(name: str, value: Any) -> Array:
     vector = as_array(name, value)
     if vector.ndim != 1 or not vector.size:
-        raise fail(name, f"{vector.shape}", "be a vector", "A single number x is passed as [x].")
+        raise fail(name, f"{vector.shape}", "be a vector", "Pass a single number x as [x].")
     return vector
 
 
 def _policy(policy: Any, m: int, n: int) -> Array:
     array = as_array("policy", policy)
     if array.ndim != 3 or array.shape[1:] != (m, n):
-        raise fail("policy", f"{array.shape}", f"have shape (memory, input, state) = (H, {m}, {n})", "Lift it first.")
+        raise fail(
+            "policy", f"{array.shape}", f"have shape (memory, input, state) = (H, {m}, {n})", "Pass problem.lift(M)."
+        )
     return array

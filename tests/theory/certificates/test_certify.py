@@ -223,7 +223,7 @@ def test_certificate_of_a_discounted_quadratic_is_the_same_when_it_is_declared_a
         ({"perturbation_bound": np.full(5, -1.0)}, "non-negative"),
         ({"noise_bound": -1.0}, "non-negative"),
         ({"wrong": 1.0}, "Check the spelling"),
-        ({"smoothness": -2.0}, "Check the sign"),
+        ({"smoothness": -2.0}, "Pass zero or more"),
     ],
 )
 def test_bad_declarations_raise(options, words):

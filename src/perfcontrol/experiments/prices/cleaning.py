@@ -41,7 +41,12 @@ def check_prices(
     as_array("prices", prices, "Fill gaps, or leave out the stock or the days; pc.experiments.read_prices does.")
     values = np.array(prices, dtype=float)
     if values.ndim != 2 or values.shape[1] < 2:
-        raise fail("prices", f"{values.shape}", "have shape (days, stocks) with two stocks or more", "One row a day.")
+        raise fail(
+            "prices",
+            f"{values.shape}",
+            "have shape (days, stocks) with two stocks or more",
+            "Pass one row a day, one column a stock.",
+        )
     labels = list(names) if names is not None else [f"stock {index}" for index in range(values.shape[1])]
     when = list(dates) if dates is not None else [f"row {index}" for index in range(values.shape[0])]
     needed = max(FEWEST, 2 * values.shape[1]) + 1

@@ -70,7 +70,12 @@ def market(
     """
     capital, rate = (check_number(name, value) for name, value in (("capital", capital), ("rate", rate)))
     if capital <= 0:
-        raise fail("capital", f"{capital:g}", "be positive", "The policy allocates it; the risk is that of 100.")
+        raise fail(
+            "capital",
+            f"{capital:g}",
+            "be positive",
+            "Pass for example capital=150.0, of which the policy allocates; the risk is that of 100.",
+        )
     values = check_prices(prices, splits=splits)
     days = recorded_days(values, rate, check_number("trading_hours", trading_hours))
     logarithms = np.log(days.growth)

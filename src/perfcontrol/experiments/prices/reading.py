@@ -49,10 +49,15 @@ def parsed(text: str) -> tuple[list[str], list[Row]]:
     """Names of the stocks, and the rows."""
     first = next((line for line in text.splitlines() if line.strip()), None)
     if first is None:
-        raise fail("prices", "an empty file", "have a header row and a row a day", "Check the file.")
+        raise fail("prices", "an empty file", "have a header row and a row a day", "Save the table as CSV anew.")
     separator = max(",;\t", key=first.count)
     if separator not in first:
-        raise fail("prices", f"the header {first.strip()[:60]!r}", "separate columns by commas", "Also ; or tabs.")
+        raise fail(
+            "prices",
+            f"the header {first.strip()[:60]!r}",
+            "separate columns by commas",
+            "Separate them by , or ; or tabs.",
+        )
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator, strict=True)
     header: list[str] | None = None
     rows: list[Row] = []
@@ -72,9 +77,11 @@ def parsed(text: str) -> tuple[list[str], list[Row]]:
             prices = [_price(cell, header[i], line) for i, cell in enumerate(cells) if i != at]
             rows.append(Row(line, _date(cells[at], line), prices))
     except csv.Error as error:
-        raise fail("prices", f"line {reader.line_num} ({error})", "be a CSV table", "Check its quotes.") from error
+        raise fail(
+            "prices", f"line {reader.line_num} ({error})", "be a CSV table", "Close its quotes, or remove them."
+        ) from error
     if header is None or not rows:
-        raise fail("prices", "a header alone", "have a row a day", "Check the file.")
+        raise fail("prices", "a header alone", "have a row a day", "Add the prices below the header, one row a day.")
     return header[:at] + header[at + 1 :], rows
 
 
@@ -100,7 +107,12 @@ def _date(cell: str, line: int) -> datetime.date:
         return datetime.date(int(match[1]), int(match[3]), int(match[4]))
     except ValueError as error:
         got = f"the date {cell.strip()!r} in line {line} ({error})"
-        raise fail("prices", got, "have dates as YYYY-MM-DD", "Other orders of day and month are ambiguous.") from error
+        raise fail(
+            "prices",
+            got,
+            "have dates as YYYY-MM-DD",
+            "Write 2024-01-31 for the last of January: other orders are ambiguous.",
+        ) from error
 
 
 def _price(cell: str, column: str, line: int) -> float:

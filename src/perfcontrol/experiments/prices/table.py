@@ -91,7 +91,9 @@ def _chosen(names: list[str], stocks: Sequence[str] | None) -> list[int]:
     position = {name.lower(): index for index, name in enumerate(names)}
     unknown = [stock for stock in stocks if stock.lower() not in position]
     if unknown:
-        raise fail("stocks", ", ".join(unknown), f"be among {', '.join(names)[:200]}", "Check the header row.")
+        raise fail(
+            "stocks", ", ".join(unknown), f"be among {', '.join(names)[:200]}", "Name stocks as the header row does."
+        )
     chosen = [position[stock.lower()] for stock in stocks]
     if len(set(chosen)) < len(chosen):
         raise fail("stocks", ", ".join(stocks), "name every stock once", "Leave out the repeated one.")
@@ -137,7 +139,7 @@ def _between(
     if not kept:
         span = f"{dates[0]} to {dates[-1]}"
         raise fail(
-            "start", f"no day from {start or dates[0]} to {end or dates[-1]}", f"lie in {span}", "Check the dates."
+            "start", f"no day from {start or dates[0]} to {end or dates[-1]}", f"lie in {span}", "Pass dates within it."
         )
     return [dates[row] for row in kept], values[kept]
 
@@ -155,7 +157,7 @@ def _check_daily(dates: list[datetime.date]) -> None:
     steps = [(later - earlier).days for earlier, later in itertools.pairwise(dates)]
     if steps and sorted(steps)[len(steps) // 2] > 4:
         got = f"rows {sorted(steps)[len(steps) // 2]} days apart"
-        raise fail("prices", got, "be daily", "Weekly or monthly prices say nothing of a day's growth.")
+        raise fail("prices", got, "be daily", "Pass daily prices: others say nothing of a day's growth.")
     if steps and max(steps) > PAUSE:
         row = steps.index(max(steps))
         got = f"no row between {dates[row]} and {dates[row + 1]}"

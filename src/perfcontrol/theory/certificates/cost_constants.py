@@ -58,7 +58,12 @@ def cost_constants(
             continue
         array = np.asarray(value, dtype=float)
         if array.shape not in ((), (length,)):
-            raise fail(name, f"shape {array.shape}", f"be a number or have shape (T+1,) = ({length},)", "One a stage.")
+            raise fail(
+                name,
+                f"shape {array.shape}",
+                f"be a number or have shape (T+1,) = ({length},)",
+                "Pass one a stage, or one for all.",
+            )
         if known != "proved":
             assumptions.append(Assumption(f"the cost's {name} {array.max():.4g}", known))
         out.append(np.broadcast_to(array, (length,)))

@@ -46,16 +46,23 @@ class Declarations:
             if (value := self.declared(name)) is not None:
                 check_shape(name, value, (), (), "Pass one number.")
                 if value < 0:
-                    raise fail(name, f"{value:.4g}", "be non-negative", "It bounds a norm.")
+                    raise fail(name, f"{value:.4g}", "be non-negative", "Pass zero or more: it bounds a norm.")
         for name in SERIES:
             if (value := self.declared(name)) is not None:
                 check_per_step(name, value, None)
         for name in COST_CONSTANTS:
             if (value := self.declared(name)) is not None:
                 if value.ndim > 1:
-                    raise fail(name, f"shape {value.shape}", "be a number or have shape (T+1,)", "One entry a stage.")
+                    raise fail(
+                        name,
+                        f"shape {value.shape}",
+                        "be a number or have shape (T+1,)",
+                        "Pass one entry a stage, or one for all.",
+                    )
                 if np.any(value < 0):
-                    raise fail(name, f"{value.min():.4g}", "be non-negative", "Check the sign.")
+                    raise fail(
+                        name, f"{value.min():.4g}", "be non-negative", "Pass zero or more: the constants bound sizes."
+                    )
 
     def declared(self, name: str) -> np.ndarray | None:
         """The declared value as an array, or None."""

@@ -49,15 +49,20 @@ def scale_range(problem: PerformativeProblem, declared: Any = None) -> ScaleRang
             return np.broadcast_to(np.asarray(value, dtype=float), shape)
         except ValueError:
             required = f"hold numbers, or arrays that broadcast to (T, k) = {shape}"
-            raise fail("scale_range", f"shape {np.shape(value)}", required, "Time comes first.") from None
+            raise fail("scale_range", f"shape {np.shape(value)}", required, "Put the time axis first.") from None
 
     if declared is not None:
         if not isinstance(declared, tuple | list) or len(declared) != 3:
             required = "be three: (low, high, Lipschitz constant)"
-            raise fail("scale_range", repr(declared), required, "For example scale_range=(0.0, 1.0, 0.5).")
+            raise fail("scale_range", repr(declared), required, "Pass for example scale_range=(0.0, 1.0, 0.5).")
         low, high, lipschitz = (full(as_array("scale_range", part)) for part in declared)
         if np.any(low > high) or np.any(lipschitz < 0):
-            raise fail("scale_range", "low > high or a negative Lipschitz constant", "be ordered", "Check the order.")
+            raise fail(
+                "scale_range",
+                "low > high or a negative Lipschitz constant",
+                "be ordered",
+                "Pass (low, high, Lipschitz constant), for example (0.0, 1.0, 0.5).",
+            )
         return ScaleRange(low, high, None, lipschitz)
     bounds, lipschitz, derivative = _known(problem)
     if bounds is None or lipschitz is None:

@@ -52,10 +52,20 @@ def rrm_error_bound(
     initial_error = _error("initial_error", initial_error)
     chosen = as_kind(kind, settings)
     if chosen.name not in ("rigorous", "paper", "global"):
-        raise fail("kind", repr(kind), "be 'rigorous', 'paper' or 'global'", "The sharp test is local: no bound.")
+        raise fail(
+            "kind",
+            repr(kind),
+            "be 'rigorous', 'paper' or 'global'",
+            "Pass one of them: the sharp test is local, and bounds nothing.",
+        )
     certificate = certify(check_end(problem), chosen)
     if not certificate.holds:
-        raise fail("problem", str(certificate), f"satisfy the {chosen.name} certificate", "No contraction is proved.")
+        raise fail(
+            "problem",
+            str(certificate),
+            f"satisfy the {chosen.name} certificate",
+            "Use pc.Sharp() for a local rate: no contraction is proved.",
+        )
     assert certificate.rate is not None
     factor = 1.0
     if chosen.name == "global" and "metric" in certificate.values:
@@ -111,7 +121,7 @@ def rsgd_error_bound(
         return curve
     if form == "printed":
         if not isinstance(rule, InverseStep):
-            raise fail("step_size", type(rule).__name__, "be an InverseStep for Theorem 1", "Or pass form='closed'.")
+            raise fail("step_size", type(rule).__name__, "be an InverseStep for Theorem 1", "Pass form='closed'.")
         phi1 = float(rule.phi1)
         n = np.arange(1, steps + 1)
         curve[1:] = np.exp(-m * phi1 * np.cumsum(1 / n)) * initial_error + 4 * phi1 * V / (m * batch * n)
@@ -136,5 +146,7 @@ def rsgd_error_bound(
 def _error(name: str, value: Any) -> float:
     value = float(value)
     if not (value >= 0 and math.isfinite(value)):
-        raise fail(name, str(value), "be a non-negative number", "It is a distance to the stable policy.")
+        raise fail(
+            name, str(value), "be a non-negative number", "Pass zero or more: it is a distance to the stable policy."
+        )
     return value

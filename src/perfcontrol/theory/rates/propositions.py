@@ -78,7 +78,9 @@ def sum_threshold(problem: PerformativeProblem, *, printed: bool = False, **decl
     assert certificate.weights is not None and certificate.rhs is not None
     if printed:
         if zeta >= 1:
-            raise fail("problem", f"ζ = {zeta:.4g}", "be strongly stable almost surely (ζ < 1)", "See Proposition 2.")
+            raise fail(
+                "problem", f"ζ = {zeta:.4g}", "be strongly stable almost surely (ζ < 1)", "Use Proposition 2 there."
+            )
         c1, c2, c3 = printed_pieces(items, certificate.values["kappa"], certificate.values["gamma"])
         mu_bar = certificate.rhs / (items.horizon - items.memory + 1)
         phi = 1 / ((c1 + c2 / (1 - zeta)) * (items.initial_bound + c3 / (1 - zeta)))
@@ -106,7 +108,7 @@ def sensitivity_envelope(
     assert certificate.weights is not None and certificate.rhs is not None
     if printed:
         if zeta <= 1:
-            raise fail("problem", f"ζ = {zeta:.4g}", "be unstable (ζ > 1)", "See Proposition 1.")
+            raise fail("problem", f"ζ = {zeta:.4g}", "be unstable (ζ > 1)", "Use Proposition 1 there.")
         c1, c2, c3 = printed_pieces(items, certificate.values["kappa"], certificate.values["gamma"])
         x0 = items.initial_bound
         scale = certificate.rhs * (zeta - 1) / (c1 * x0 + (c1 * c3 + c2 * c3 + c3 * x0) / zeta)
@@ -124,7 +126,9 @@ def envelope_shape(zeta: float, horizon: int, *, printed: bool = False) -> np.nd
     """
     horizon = check_integer("horizon", horizon, 1)
     if not zeta > 1:
-        raise fail("zeta", f"{zeta}", "exceed 1", "Proposition 2 is about growing dynamics.")
+        raise fail(
+            "zeta", f"{zeta}", "exceed 1", "Use Proposition 1 otherwise: Proposition 2 is about growing dynamics."
+        )
     t = np.arange(horizon)
     if printed:
         return 1 / (zeta ** (horizon - t) - 1.0)

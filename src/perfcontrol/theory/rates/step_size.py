@@ -40,7 +40,12 @@ def descent_constants(
     check_end(problem)
     chosen = as_kind(kind, declared)
     if chosen.name not in ("rigorous", "paper"):
-        raise fail("kind", repr(kind), "be 'rigorous' or 'paper'", "Only these two come with gradient bounds.")
+        raise fail(
+            "kind",
+            repr(kind),
+            "be 'rigorous' or 'paper'",
+            "Pass one of them: only these two come with gradient bounds.",
+        )
     certificate = certify(problem, chosen)
     if not certificate.applicable:
         raise fail(
@@ -55,7 +60,7 @@ def descent_constants(
             "problem",
             f"S = {certificate.lhs:.4g} ≥ μ̃ = {certificate.rhs:.4g}",
             "have an aggregated sensitivity S below the strong convexity μ̃",
-            "No step size is proved to work then; pc.safe_step finds one by local analysis.",
+            "Use pc.safe_step, which finds a step by local analysis: none is proved to work here.",
         )
     constants = certificate.values["constants"]
     return DescentConstants(

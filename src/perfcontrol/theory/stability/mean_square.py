@@ -90,7 +90,7 @@ class MeanSquareStability:
                 "step",
                 f"{step:.4g}",
                 f"lie between 0 and the threshold {self.threshold_estimate:.4g}",
-                "Above it the error has no stationary covariance.",
+                "Pass a smaller step: above it the error has no stationary covariance.",
             )
         noise = step**2 * self.gradient_covariance / self.batch
         apply, X = self.operator(step), np.zeros_like(noise)

@@ -59,7 +59,9 @@ def mean_square_stability(
     if M is None:
         solution = find_stable_policy(problem)
         if solution.result != Result.success:
-            raise fail("problem", "none found", "have a stable policy", "See pc.certify(problem, 'sharp').")
+            raise fail(
+                "problem", "none found", "have a stable policy", "Print pc.certify(problem, 'sharp'), which says why."
+            )
         M = solution.M
     model = local_model(problem, problem.check_policy("M", M))
     return stability_of(problem, model, largest_mean_step(model), batch, samples, key)

@@ -166,8 +166,10 @@ def check_per_step(name: str, value: Any, horizon: int | None) -> np.ndarray:
         array = np.full(1 if horizon is None else horizon, float(array))
     if array.ndim != 1 or (horizon is not None and len(array) != horizon):
         wanted = "have one entry for each t = 0..T-1" + ("" if horizon is None else f", that is {horizon}")
-        raise fail(name, f"shape {array.shape}", wanted, "A single number is repeated.")
+        raise fail(name, f"shape {array.shape}", wanted, "Pass one of them; a single number is repeated.")
     if np.any(array < 0):
         t = int(np.argmin(array))
-        raise fail(name, f"{array[t]:.4g} at t = {t}", "be non-negative", "It bounds a norm or a distance.")
+        raise fail(
+            name, f"{array[t]:.4g} at t = {t}", "be non-negative", "Pass zero or more: it bounds a norm or a distance."
+        )
     return array
