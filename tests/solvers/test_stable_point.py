@@ -1,5 +1,7 @@
 """StablePoint: beyond repeated minimisation, without a fixed point, and where the minimiser is not unique."""
 
+import importlib
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -217,3 +219,20 @@ def test_stable_policy_is_not_called_unique_on_row_sums_when_the_covariance_has_
     across = scipy.linalg.null_space(np.stack([FACTOR[:, 0], np.ones(3)]))
     assert np.abs(np.asarray(solution.M) @ across).max() < 1e-9
     np.testing.assert_allclose(np.asarray(solution.M).sum(axis=-1), 0.6, rtol=1e-12)
+
+
+@pytest.mark.parametrize("expands", [False, True])
+def test_stable_point_of_many_parameters_matches_that_of_few(expands, monkeypatch):
+    """Neither the Hessian nor Φ' is held as a matrix then, and factors are Cholesky's."""
+    problem = strongly_performative(8.0) if expands else performative_prediction(0.5)
+    expected = pc.solve(problem, SOLVER)
+    monkeypatch.setattr(importlib.import_module("perfcontrol.response.quadratic"), "DENSE_LIMIT", 0)
+    monkeypatch.setattr(importlib.import_module("perfcontrol.response.definite"), "EIGENVALUES", 0)
+    monkeypatch.setattr(importlib.import_module("perfcontrol.solvers.stable_point"), "DENSE", 0)
+    jax.clear_caches()
+    try:
+        found = pc.solve(problem, pc.StablePoint(max_steps=31))
+        assert_close(found.M, expected.M, 1e-9)
+        assert float(found.stats["residual"]) <= 1e-11
+    finally:
+        jax.clear_caches()  # programs made with these limits

@@ -67,17 +67,28 @@ def sustained_form(world: World, memory: int) -> Array:
     if isinstance(world, StationaryWorld):  # in the long run the lags do not differ
         return jnp.tile(world.sustained(), (memory, memory))
     length, m = world.S.shape[0], world.S.shape[-1]
+    size = memory * m
     active = (jnp.arange(length)[:, None] >= jnp.arange(1, memory + 1)).astype(world.S.dtype)  # (T+1, H)
     B = as_dense(along_time(world.B, 2, length - 1))
-    push = (B[:, :, None, :] * active[:-1, None, :, None]).reshape(length - 1, B.shape[1], memory * m)
     varying = world.F.ndim == 3
 
     def advance(X: Array, step: Any) -> tuple[Array, Array]:
-        F_t, push_t = step
-        return (F_t if varying else world.F) @ X + push_t, X
+        """X_t, the state that the columns of ṽ have led to, goes on; D_t X_t is what it couples to."""
+        F_t, B_t, D_t, active_t = step
+        push = (B_t[:, None, :] * active_t[:, None]).reshape(-1, size)
+        return (F_t if varying else world.F) @ X + push, D_t @ X
 
-    last, X = jax.lax.scan(advance, jnp.zeros_like(push[0]), (world.F if varying else None, push))
-    states = jnp.concatenate([X, last[None]])  # X_t: the state that the columns of ṽ have led to
-    coupled = tail_sums(world.D @ states, memory, length).reshape(memory * m, memory * m)
+    def add(carry: tuple[Array, Array], step: Any) -> tuple[tuple[Array, Array], None]:
+        X, coupled = advance(carry[0], step)
+        return (X, carry[1] + coupled), None
+
+    steps = (world.F if varying else None, B, world.D[:-1], active[:-1])
+    early, late = (
+        jax.tree.map(lambda leaf, part=part: leaf[part], steps) for part in (slice(memory), slice(memory, None))
+    )
+    X, single = jax.lax.scan(advance, jnp.zeros((B.shape[1], size), B.dtype), early)
+    (X, rest), _ = jax.lax.scan(add, (X, jnp.zeros_like(single[0])), late)
+    parts = jnp.concatenate([single[1:], (rest + world.D[-1] @ X)[None]])  # all that t >= H adds in one
+    coupled = jnp.flip(jnp.cumsum(jnp.flip(parts, axis=0), axis=0), axis=0).reshape(size, size)
     held = tail_sums(world.S, memory, length)[jnp.maximum(*jnp.indices((memory, memory)))]
-    return coupled + coupled.T + held.transpose(0, 2, 1, 3).reshape(memory * m, memory * m)
+    return coupled + coupled.T + held.transpose(0, 2, 1, 3).reshape(size, size)

@@ -79,8 +79,10 @@ class AffineByProducts:
         return self.project(V) - self.origin
 
     def solve(self, gradient: Array) -> Array:
-        """The Newton step for a gradient."""
+        """The Newton step for a gradient, or for each of several along the first axis."""
         form = self.form
+        if gradient.ndim > form.linear.ndim:
+            return jax.lax.map(self.solve, gradient)
 
         def hessian(V: Array) -> Array:
             return self._tangent(form.gradient(self._tangent(V)) - form.linear)

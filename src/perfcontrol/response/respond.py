@@ -52,6 +52,13 @@ def _separable(problem: PerformativeProblem, world: World) -> bool:
     return free and stationary(world)
 
 
+def _on_host(problem: PerformativeProblem, deployed: Any, *others: Any) -> bool:
+    """Whether the method works on the host, step by step: where the Hessian is held, or its factors are regular."""
+    if not known(problem, deployed, *others):
+        return False
+    return _held(problem) or _separable(problem, jax.eval_shape(world_of, problem, deployed))
+
+
 def _shape_of_cost(problem: PerformativeProblem, world: World) -> Any:
     """What the methods need to know of the quadratic; finite unless the world overflows."""
     if _separable(problem, world):
@@ -68,11 +75,32 @@ def _method(problem: PerformativeProblem, world: World, form: Any) -> Method:
     return Projected(problem.feasible_set, form)
 
 
+class _ByProducts(NamedTuple):
+    """`AffineByProducts` in one program."""
+
+    problem: PerformativeProblem
+    world: World
+
+    def solve(self, gradient: Any) -> Any:
+        return _solve_by_products(self.problem, self.world, gradient)
+
+    def minimise(self, start: Any) -> tuple[Any, Any]:
+        return _minimise_by_products(self.problem, self.world, start)
+
+
+def _by_products(problem: PerformativeProblem, world: World) -> AffineByProducts:
+    return AffineByProducts(problem.feasible_set, quadratic_by_passes(problem, world))
+
+
+_solve_by_products = program(lambda problem, world, gradient: _by_products(problem, world).solve(gradient))
+_minimise_by_products = program(lambda problem, world, start: _by_products(problem, world).minimise(start))
+
+
 def _separable_method(problem: PerformativeProblem, world: World, form: Factors) -> Separable:
-    def dense() -> Affine | AffineByProducts:
+    def dense() -> Affine | _ByProducts:
         if _held(problem):
             return Affine(problem.feasible_set, quadratic(problem, world))
-        return AffineByProducts(problem.feasible_set, quadratic_by_passes(problem, world))
+        return _ByProducts(problem, world)
 
     return Separable(form, dense)
 
@@ -112,7 +140,7 @@ def respond(problem: PerformativeProblem, deployed: Any, start: Any = None, inne
         if inner_steps is not None:
             return Response(approach(problem, on_host(deployed), on_host(start), inner_steps), np.asarray(True))
         return Response(*minimise(problem, on_host(deployed), on_host(start)))
-    if known(problem, deployed, start) and _held(problem):
+    if _on_host(problem, deployed, start):
         with np.errstate(all="ignore"):
             return _respond(problem, on_host(deployed), on_host(start), inner_steps)
     # Loops are not differentiated: nothing that varies goes in.
@@ -199,7 +227,7 @@ def residual_of(problem: PerformativeProblem, M: Any, deployed: Any, gradient: A
     """`natural_residual`; from the host where that can be, else as one program."""
     if isinstance(problem, Sampled):
         return sampled_residual(problem, on_host(M), on_host(deployed))
-    if known(problem, M, deployed) and _held(problem):
+    if _on_host(problem, deployed, M):
         with np.errstate(all="ignore"):
             return natural_residual(problem, on_host(M), on_host(deployed), gradient)
     return _residual_in_one_program(problem, M, deployed, gradient)
@@ -207,7 +235,7 @@ def residual_of(problem: PerformativeProblem, M: Any, deployed: Any, gradient: A
 
 def step_of(problem: PerformativeProblem, deployed: Any) -> Any:
     """η = 1/‖Hessian of C_T(·; deployed)‖: the length of a safe gradient step; NaN where the world overflows."""
-    if known(problem, deployed) and _held(problem):
+    if _on_host(problem, deployed):
         with np.errstate(all="ignore"):
             return _step_at(problem, on_host(deployed))
     return _step_in_one_program(problem, deployed)

@@ -7,7 +7,8 @@ with H m unknowns. Where G or Σ is singular, the dense method serves.
 from collections.abc import Callable
 from typing import Any
 
-from perfcontrol._programs import cond, numerics
+from perfcontrol._programs import cond, known, numerics
+from perfcontrol.response.definite import Definite
 from perfcontrol.response.quadratic import Factors, Operator
 
 
@@ -24,13 +25,13 @@ class Separable:
         _, G, G_mean, Sigma, w = factors
         self.shape = H, m, n = factors.linear.shape
         eps, tiny = xp.finfo(G.dtype).eps, xp.finfo(G.dtype).tiny
-        G_values, self.G_vectors = xp.linalg.eigh(G)
+        self.G = Definite(G)
         S_values, S_vectors = xp.linalg.eigh(Sigma)
-        self.regular = (G_values[0] > H * m * eps * G_values[-1]) & (S_values[0] > n * eps * S_values[-1])
-        self.G_values = xp.where(G_values > 0, G_values, 1)
-        largest = 2 * (G_values[-1] * S_values[-1] + xp.trace(G_mean) * (w @ w))
+        self.regular = self.G.regular & (S_values[0] > n * eps * S_values[-1])
+        largest = 2 * (self.G.largest * S_values[-1] + xp.trace(G_mean) * (w @ w))
         self.step = 1 / xp.maximum(largest, tiny)
         self.inverse_root = (S_vectors / xp.sqrt(xp.where(S_values > 0, S_values, 1))) @ S_vectors.T
+        self.centred = known(w) and not xp.any(w)
         a = self.inverse_root @ w
         squared = a @ a
         self.unit = a / xp.sqrt(xp.where(squared > 0, squared, 1))
@@ -41,9 +42,11 @@ class Separable:
         """Newton steps for gradients (k, H, m, n)."""
         H, m, n = self.shape
         right = -gradients.reshape(-1, H * m, n) @ self.inverse_root / 2
+        if self.centred:
+            return (self.G.solve(right) @ self.inverse_root).reshape(gradients.shape)
         mean_part = right @ self.unit  # (k, Hm)
         across = right - mean_part[..., None] * self.unit
-        Y = self.G_vectors @ ((self.G_vectors.T @ across) / self.G_values[:, None])
+        Y = self.G.solve(across)
         factor = self.linalg.cho_factor(self.along, lower=True)
         along = self.linalg.cho_solve(factor, mean_part.T).T
         Y = Y + (along - Y @ self.unit)[..., None] * self.unit

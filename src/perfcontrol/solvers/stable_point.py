@@ -155,6 +155,11 @@ def _by_products(problem: PerformativeProblem, M: Any, response: Any) -> Array:
     """The direction by GMRES, with products Φ'(M) V alone."""
     pushforward = response_pushforward(problem, M, response)
     direction, _ = jax.scipy.sparse.linalg.gmres(
-        lambda V: V - pushforward(V), response - M, tol=1e-10, restart=min(KRYLOV, M.size), maxiter=4
+        lambda V: V - pushforward(V),
+        response - M,
+        tol=1e-10,
+        restart=min(KRYLOV, M.size),
+        maxiter=4,
+        solve_method="incremental",  # which ends as soon as the tolerance is met
     )
     return jnp.asarray(direction)
