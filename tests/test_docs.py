@@ -36,7 +36,8 @@ def assert_same_print(printed, said):
         assert float(found) == pytest.approx(float(expected), rel=2e-2), printed
 
 
-def test_tutorial_prints_what_the_page_says():
+def test_tutorial_prints_what_the_page_says(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # it saves a file
     names = {}
     blocks = [block for block in notebook.blocks(TUTORIAL) if block[1]]
     assert len(blocks) >= 8
