@@ -10,11 +10,13 @@ class Names(griffe.Extension):
 
     def on_package(self, *, pkg: griffe.Module, **_: Any) -> None:
         """A function exported under the name of its own module is meant where that name is exported."""
-        for name in pkg.exports or ():
-            target = pkg[str(name)]
+        if "_api" not in pkg.members:
+            return
+        for name in map(str, pkg["_api"].exports or ()):
+            target = pkg["_api"][name]
             while target.is_module and target.name in target.members:
                 target = target[target.name]
-                pkg.set_member(str(name), griffe.Alias(str(name), target=target, parent=pkg))
+                pkg.set_member(name, griffe.Alias(name, target=target, parent=pkg))
 
     def on_function(self, *, func: griffe.Function, **_: Any) -> None:
         """`Any` stands for "array-like" in signatures: the description gives the shape."""

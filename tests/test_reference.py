@@ -101,6 +101,13 @@ def draw(content, name="theory.md"):
     return hooks.on_page_content(content, page=page)
 
 
+def test_reference_shows_functions_and_classes_not_the_modules_that_hold_them():
+    extensions = griffe.load_extensions(str(DOCS / "inspection.py") + ":Names")
+    package = griffe.load("perfcontrol", search_paths=[str(DOCS.parent / "src")], extensions=extensions)
+    kinds = {name: package[name].kind.value for name, _ in ENTRIES if package[name].kind.value == "module"}
+    assert kinds == {}
+
+
 def test_equations_are_drawn_aligned_and_the_source_is_gone():
     latex = r"\[ \begin{aligned} a' &amp;= \sum_{i=1}^{n} b_i \\ c &amp;= d \end{aligned} \]".replace("\\[ ", "\\[")
     drawn = draw(f'<div class="arithmatex">{latex}</div> and <span class="arithmatex">\\(x_t\\)</span>')
