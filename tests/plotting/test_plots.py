@@ -157,19 +157,13 @@ def test_certain_costs_are_drawn_too():
     pc.plotting.plot_costs(problem, [[[0.0]]], key=KEY, samples=4).figure.canvas.draw()
 
 
-@pytest.mark.parametrize("limit", [0.5, 2.0, 1e3], ids=["does not hold", "holds", "holds by far"])
-def test_certificate_draws_its_contributions_their_sum_and_the_limit_where_it_is_near(limit):
-    shares = np.array([0.0, 0.4, 0.6])
+@pytest.mark.parametrize("limit", [0.5, 2.0], ids=["does not hold", "holds"])
+def test_certificate_draws_its_contributions_and_says_both_sides(limit):
+    shares = np.array([-0.1, 0.4, 0.7])
     certificate = pc.Certificate("rigorous", "", True, holds=limit > 1, lhs=1.0, rhs=limit, contributions=shares)
     axes = pc.plotting.plot_certificate(certificate)
     assert_close([bar.get_height() for bar in axes.containers[0]], shares)
-    drawn = [np.asarray(line.get_ydata()) for line in axes.lines]
-    if limit < 20:
-        assert_close(drawn[0], [0.0, 0.4, 1.0])
-        assert drawn[1][0] == limit and axes.get_ylim()[1] > limit
-    else:
-        assert drawn == []
-    assert ("does not" in axes.get_title()) == (limit < 1)
+    assert axes.get_title() in (r"rigorous: 1 $\geq$ 0.5, does not hold", "rigorous: 1 $<$ 2, holds")
     axes.figure.canvas.draw()
 
 

@@ -139,6 +139,7 @@ def test_run_that_was_kept_is_reported_from_its_folder_by_the_command_line(tmp_p
     assert page.headings[0][1] == "Performative control: run"
 
 
+@pytest.mark.slow
 def test_infinite_horizon_is_reported_per_stage():
     problem = reacting(horizon=math.inf, noise=pc.Gaussian([0.0], [[1.0]]))
     report = pc.report(problem, samples=16)

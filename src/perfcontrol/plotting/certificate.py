@@ -10,14 +10,11 @@ from perfcontrol.plotting.style import LOOKS, styled
 from perfcontrol.plotting.subjects import panels
 from perfcontrol.theory import Certificate, Sharp
 
-COMPARABLE = 20.0  # the ratio of both sides up to which they are shown on one axis
-
 
 def plot_certificate(certificate: Certificate, *, ax: Any = None) -> Axes:
     """What each sensitivity ε_t adds to the left side of a certificate; of the sharp one what each reaction Δ_t adds.
 
-    Where both sides are of one size (up to a factor of 20), also their running sum, and the right side that it must
-    stay below. The title says both sides.
+    The title says both sides, and whether the certificate holds.
 
     Args:
         certificate: with contributions, as of `pc.certify(problem, "rigorous")`, "paper" or `pc.Sharp(by_time=True)`.
@@ -32,17 +29,11 @@ def plot_certificate(certificate: Certificate, *, ax: Any = None) -> Axes:
     certificate = check_instance("certificate", certificate, Certificate, "pc.certify(problem, 'rigorous')")
     shares = contributions_of(certificate)
     total, limit = float(certificate.lhs or 0.0), float(certificate.rhs or 0.0)
-    comparable = total > 0 and limit > 0 and max(total / limit, limit / total) <= COMPARABLE
     with styled():
         axes = panels(ax, 1, (4.2, 2.8))[0]
         t = np.arange(len(shares))
         label = r"contribution of $\Delta_t$" if certificate.kind == Sharp.name else r"contribution of $\varepsilon_t$"
-        axes.bar(t, shares, width=0.85, color=LOOKS["optimal"].colour, alpha=0.6, label=label)
-        if comparable:
-            axes.step(t, np.cumsum(shares), where="mid", color=LOOKS["stable"].colour, label="sum so far")
-            axes.axhline(limit, color="#7F7F7F", linestyle=(0, (5, 2)), label="must stay below")
-            axes.set_ylim(top=1.5 * max(total, limit))  # room for the legend
-            axes.legend(loc="upper left", ncols=3, columnspacing=1.0, handlelength=1.5)
+        axes.bar(t, shares, width=0.85, color=LOOKS["optimal"].colour, alpha=0.6)
         axes.set_axisbelow(True)
         axes.set_xlim(-0.7, len(shares) - 0.3)
         axes.set_xlabel("time $t$")

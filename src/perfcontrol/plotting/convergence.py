@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.ticker import MaxNLocator
 
 from perfcontrol._checks import check_integer, fail
 from perfcontrol.plotting.style import looks, styled
@@ -60,6 +61,8 @@ def plot_convergence(solutions: Any, reference: Any = None, *, every: Any = 1, a
         if longest > SHORT:
             axes.set_xscale("symlog", linthresh=1, linscale=0.3)
             axes.set_xlim(left=0)
+        else:
+            axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         axes.set_xlabel("step $n$")
         axes.set_ylabel(r"$\|M_n - M\|_F$" if reference is not None else "distance to the last policy")
         if len(named) > 1:

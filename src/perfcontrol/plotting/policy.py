@@ -1,5 +1,6 @@
 """A policy as a heat map: which past disturbance moves which input, lag by lag."""
 
+import math
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from perfcontrol.plotting.subjects import input_names, panels, plain, state_name
 from perfcontrol.problem import PerformativeProblem, check_problem
 
 WRITTEN = 60  # entries up to which each is written into its cell
-NAMED = 24  # columns up to which each has its name
+NAMED = 12  # rows or columns up to which each has its name; of more, so many evenly spaced ones
 LETTERS = 18  # of a name that are shown
 
 
@@ -48,7 +49,7 @@ def plot_policy(problem: PerformativeProblem, M: Any, *, limit: float | None = N
         axes.invert_yaxis()
         for lag in range(1, lags):
             axes.axvline(lag * states, color="white", linewidth=4)
-        if stack.size <= WRITTEN:
+        if columns <= NAMED and stack.size <= WRITTEN:
             for (j, k), value in np.ndenumerate(stack):
                 shade = "white" if abs(value) > 0.62 * largest else "black"
                 axes.text(k + 0.5, j + 0.5, f"{value:.2g}", ha="center", va="center", fontsize=7, color=shade)
@@ -63,13 +64,13 @@ def heat_map_size(problem: PerformativeProblem) -> tuple[float, float]:
     lags, rows, states = problem.lifted_shape
     names = [_short(name) for name in state_names(problem)]
     below = 0.07 * max(map(len, names)) if _turned(problem, names) else 0.0
-    return min(max(2.2, 1.1 + 0.45 * lags * states), 7.0), min(max(1.3, 1.0 + 0.34 * rows), 5.6) + below
+    return min(max(2.2, 1.1 + 0.42 * lags * states), 4.4), min(max(1.3, 1.0 + 0.34 * rows), 3.8) + below
 
 
 def _turned(problem: PerformativeProblem, names: list[str]) -> bool:
     """Whether names of the states are too long to stand side by side."""
     columns = problem.lifted_shape[0] * len(names)
-    return columns <= NAMED and max(map(len, names)) * 0.075 > max(0.42, 1.6 / columns)
+    return columns <= NAMED and max(map(len, names)) * 0.075 > max(0.4, 1.6 / columns)
 
 
 def _short(name: str) -> str:
@@ -82,18 +83,18 @@ def _label(axes: Axes, problem: PerformativeProblem, lags: int) -> None:
     axes.tick_params(length=0)
     for spine in axes.spines.values():
         spine.set_visible(False)
-    named = [_short(name) for name in input_names(problem)] if rows <= NAMED else [""] * rows
-    axes.set_yticks(np.arange(rows) + 0.5, named)
+    inputs = range(0, rows, math.ceil(rows / NAMED))
+    axes.set_yticks([row + 0.5 for row in inputs], [_short(input_names(problem)[row]) for row in inputs])
     axes.set_ylabel("input")
-    if lags * states <= NAMED:
-        names = [_short(name) for name in state_names(problem)]
-        rotation = 90 if _turned(problem, names) else 0
-        axes.set_xticks(np.arange(lags * states) + 0.5, names * lags, rotation=rotation)
-        axes.set_xlabel("disturbance of")
-    else:
-        axes.set_xticks([])
-        axes.set_xlabel("disturbances of the states, in order")
+    names = [_short(name) for name in state_names(problem)]
+    apart = math.ceil(lags * states / NAMED) if lags * states > NAMED else 1
+    named = [(lag, state) for lag in range(lags) for state in range(0, states, apart)]
+    turned = apart > 1 or _turned(problem, names)
+    axes.set_xticks([lag * states + state + 0.5 for lag, state in named], [names[state] for _, state in named])
+    axes.tick_params(axis="x", labelrotation=90 if turned else 0)
+    axes.set_xlabel("disturbance of")
     top = axes.secondary_xaxis("top")
-    top.set_xticks(states * (np.arange(lags) + 0.5), [f"lag {lag + 1}" for lag in range(lags)])
+    shown = range(0, lags, math.ceil(lags / 8))
+    top.set_xticks([states * (lag + 0.5) for lag in shown], [f"lag {lag + 1}" for lag in shown])
     top.tick_params(length=0)
     top.spines["top"].set_visible(False)

@@ -41,7 +41,7 @@ def rate_when(problem, M, time, factor):
     [
         random_problem(0, strength=0.5, bounded=False),
         random_problem(3, strength=0.5),
-        random_problem(1, "wide", strength=0.3, bounded=False),
+        pytest.param(random_problem(1, "wide", strength=0.3, bounded=False), marks=pytest.mark.slow),
         steered(),
     ],
     ids=["free", "ball", "two directions", "mean and scale"],
@@ -68,6 +68,7 @@ def test_certificate_splits_its_rate_when_asked():
     assert pc.plotting.plot_certificate(split).get_title().startswith("sharp")
 
 
+@pytest.mark.slow
 def test_reaction_of_the_market_is_split_too():
     problem = pc.experiments.stock_market("descending")
     certificate = pc.certify(problem, pc.Sharp(samples=0, pairs=0, by_time=True))

@@ -40,8 +40,9 @@ thead th { border-bottom-width: 2px; }
 tbody th { font-weight: 600; }
 figure { margin: 1.2rem 0; }
 figcaption { color: var(--muted); max-width: 46rem; font-size: .95rem; }
-.panels { display: flex; flex-wrap: wrap; gap: 1rem 1.4rem; align-items: flex-end; }
-.panels > div { flex: 1 1 17rem; }
+.panels { display: grid; gap: 1rem 1.4rem; align-items: end;
+  grid-template-columns: repeat(auto-fill, minmax(min(100%, calc(1.12 * var(--width))), 1fr)); }
+.panels > div { max-width: calc(1.4 * var(--width)); }
 svg { display: block; width: 100%; height: auto; color: var(--ink); }
 svg * { stroke-linejoin: round; stroke-linecap: butt; }
 .legend span { margin-right: 1.4rem; white-space: nowrap; }
@@ -59,7 +60,7 @@ code { font-size: .92em; }
   h2, h3 { break-after: avoid; }
   figure, tr, .short { break-inside: avoid; }
   .wide { overflow: visible; }
-  .panels > div { flex-basis: 14rem; }
+  .panels { grid-template-columns: repeat(auto-fill, minmax(min(100%, var(--width)), 1fr)); }
 }
 """
 

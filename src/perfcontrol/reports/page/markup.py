@@ -45,7 +45,10 @@ def number(value: Any, figures: int = 6) -> Html:
     value = float(value)
     if not np.isfinite(value):
         return Html("infinite" if value > 0 else "−infinite" if value < 0 else "not a number")
-    return Html(f'<data value="{value!r}">{f"{value:.{figures}g}".replace("-", "−")}</data>')
+    shown = f"{value:.{figures}g}"
+    if "e" in shown and 1 <= abs(value) < 1e7:
+        shown = f"{float(shown):.0f}"  # 16000, and not 1.6e+04
+    return Html(f'<data value="{value!r}">{shown.replace("-", "−")}</data>')
 
 
 def joined(parts: Iterable[Any]) -> Html:
@@ -89,8 +92,7 @@ def table(caption: str, header: Sequence[Any], rows: Iterable[Sequence[Any]]) ->
 def figures(drawings: Sequence[Any], caption: Any, headings: Sequence[Any] = ()) -> Html:
     """Drawings side by side, as many as there is room for, each below its heading if it has one, under one caption."""
     titles = [subheading(one) for one in headings] or [""] * len(drawings)
-    parts = "".join(
-        f'<div style="max-width:{1.35 * one.width:.0f}px">{title}{one.svg}</div>'
-        for one, title in zip(drawings, titles, strict=True)
-    )
-    return Html(f'<figure><div class="panels">{parts}</div><figcaption>{text(caption)}</figcaption></figure>\n')
+    width = max((one.width for one in drawings), default=0.0)  # in points, of which a pixel is 3/4
+    parts = "".join(f"<div>{title}{one.svg}</div>" for one, title in zip(drawings, titles, strict=True))
+    panels = f'<div class="panels" style="--width:{width:.0f}px">{parts}</div>'
+    return Html(f"<figure>{panels}<figcaption>{text(caption)}</figcaption></figure>\n")
