@@ -136,9 +136,9 @@ SOLVERS = {
         pc.RSGD(200, pc.InverseStep(1, 2), 3, pc.TwoPoint(0.1), pc.Lazy(2), average=pc.Average(0.5)),
         pc.RSGD(9, 0.1, truncation=5),  # for infinite horizons alone
     ],
-    "RRM": [pc.RRM(1e-6, 9, pc.SampleAverage(64, 128), inner_steps=3, anderson=2)],
+    "RRM": [pc.RRM(1e-4, 9, pc.SampleAverage(64, 128), inner_steps=3, anderson=2)],
     "StablePoint": [pc.StablePoint(), pc.StablePoint(1e-4, 3, rescue=False)],
-    "PerformativeOptimum": [pc.PerformativeOptimum(3, 1e-7, 8)],
+    "PerformativeOptimum": [pc.PerformativeOptimum(3, 1e-4, 8)],
     "Continuation": [pc.Continuation(max_steps=17)],
     "SampleAverage": [pc.StablePoint(sampling=pc.SampleAverage(4))],
     "Average": [pc.RSGD(100, 0.1, average=pc.Average(0.1, "batch means"))],
@@ -183,6 +183,7 @@ def test_problem_comes_back_bit_for_bit(build, tmp_path):
     assert fingerprint(pc.load(tmp_path / "problem.toml")) == fingerprint(made)
 
 
+@pytest.mark.float32
 @pytest.mark.parametrize("solver", [pytest.param(s, id=name) for name, each in SOLVERS.items() for s in each])
 def test_plan_comes_back_bit_for_bit(solver, tmp_path):
     horizon = T if getattr(solver, "truncation", None) is None else math.inf
@@ -190,7 +191,7 @@ def test_plan_comes_back_bit_for_bit(solver, tmp_path):
     write_plan(plan, tmp_path / "plan.toml")
     back = read_plan(tmp_path / "plan.toml")
     assert fingerprint((back.problem, back.solver)) == fingerprint((plan.problem, plan.solver))
-    np.testing.assert_array_equal(back.M0, plan.M0)
+    np.testing.assert_array_equal(back.M0, jnp.asarray(plan.M0))
     assert back.seed == plan.seed
 
 
@@ -264,6 +265,7 @@ def test_file_that_unpacks_to_more_than_it_is_is_refused(tmp_path):
         pc.load(tmp_path / "bomb.npz")
 
 
+@pytest.mark.float32
 def test_run_comes_back_with_labelled_history(tmp_path):
     names = ["level", "flow"]
     made = problem(system=pc.LinearSystem(draw(n, n) / 3, draw(n, m), names, ["u"]))

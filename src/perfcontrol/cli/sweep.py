@@ -3,7 +3,7 @@
 import json
 import math
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.table import Table
@@ -11,6 +11,9 @@ from rich.table import Table
 from perfcontrol.cli.app import app, configure_jax, console, in_words
 from perfcontrol.cli.plans import AsJson, File, Seed, Settings, cost_of, new_folder, solved
 from perfcontrol.cli.progress import stages
+
+if TYPE_CHECKING:
+    from perfcontrol.files.run import Run
 
 SHOWN = 40  # rows of the table
 
@@ -63,40 +66,21 @@ def fill(folder: Path, record: dict[str, Any], as_json: bool) -> None:
     """Solve the points that are not finished, and show the whole; exit with 1 where one did not end as asked."""
     import dataclasses
 
-    from perfcontrol._printing import public_name
     from perfcontrol.files.changing import changed
     from perfcontrol.files.run import now, write_record
-    from perfcontrol.files.solutions import write_solution
-    from perfcontrol.files.sweep import POINTS, base_of, finished, plan_at, points_of, read_sweep
-    from perfcontrol.results import save_dataset, save_json
-    from perfcontrol.solvers import Result
+    from perfcontrol.files.sweep import base_of, finished, plan_at, points_of, read_sweep
+    from perfcontrol.results import save_dataset
 
     document = changed(base_of(folder), record["settings"])
     points = points_of(record["axes"])
     done = {number for number, _ in finished(folder)}
     with stages(transient=True) as show:
         for number, point in enumerate(points):
-            if number in done:
-                continue
-            show("points", number / len(points))
-            plan = plan_at(document, point)
-            plan = plan if record["seed"] is None else dataclasses.replace(plan, seed=record["seed"])
-            run = solved(plan, lambda *_: None)
-            solution = run.solution
-            cost = cost_of(run.problem, solution.M, run.seed)
-            scalars = {name: float(value) for name, value in solution.stats.items() if not value.ndim}
-            numbers = {
-                "cost": cost["cost"],
-                "standard_error": cost["standard_error"],
-                "success": float(solution.result == Result.success),
-                "steps": int(solution.steps),
-                "seconds": run.seconds,
-                **scalars,
-            }
-            known = {name: value for name, value in numbers.items() if value is not None and math.isfinite(value)}
-            write_solution(solution, folder / POINTS / f"{number:06d}.npz")
-            row = {"point": point, "solver": public_name(run.solver), "result": Result[solution.result]}
-            save_json({**row, "numbers": known}, folder / POINTS / f"{number:06d}.json")
+            if number not in done:
+                show("points", number / len(points))
+                plan = plan_at(document, point)
+                plan = plan if record["seed"] is None else dataclasses.replace(plan, seed=record["seed"])
+                _keep_point(folder, number, point, solved(plan, lambda *_: None))
     dataset = read_sweep(folder, record)
     save_dataset(dataset, folder / "results.nc", {})
     write_record(folder, record | {"ended": now()})
@@ -106,6 +90,28 @@ def fill(folder: Path, record: dict[str, Any], as_json: bool) -> None:
     else:
         _show(rows, record["axes"], folder)
     raise typer.Exit(0 if all(row["numbers"]["success"] for row in rows) else 1)
+
+
+def _keep_point(folder: Path, number: int, point: dict[str, Any], run: "Run") -> None:
+    """Write what a point has given, its numbers last: they say that it is finished."""
+    from perfcontrol._printing import public_name
+    from perfcontrol.files.solutions import write_solution
+    from perfcontrol.files.sweep import POINTS
+    from perfcontrol.results import save_json
+    from perfcontrol.solvers import Result
+
+    solution = run.solution
+    numbers: dict[str, Any] = {
+        **cost_of(run.problem, solution.M, run.seed),
+        "success": float(solution.result == Result.success),
+        "steps": int(solution.steps),
+        "seconds": run.seconds,
+        **{name: float(value) for name, value in solution.stats.items() if not value.ndim},
+    }
+    known = {name: value for name, value in numbers.items() if isinstance(value, int | float) and math.isfinite(value)}
+    row = {"point": point, "solver": public_name(run.solver), "result": Result[solution.result], "numbers": known}
+    write_solution(solution, folder / POINTS / f"{number:06d}.npz")
+    save_json(row, folder / POINTS / f"{number:06d}.json")
 
 
 def _show(rows: list[dict[str, Any]], axes: dict[str, list[Any]], folder: Path) -> None:

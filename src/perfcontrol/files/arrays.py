@@ -14,11 +14,12 @@ SUFFIXES = (".npy", ".csv")
 
 
 def array_of(value: Any, place: Place) -> Any:
-    """A number as it is, lists and files as NumPy arrays; raises InputError for anything else."""
+    """Numbers and rectangular lists as they are, files as NumPy arrays; raises InputError for anything else."""
     if isinstance(value, str):
         return _beside(value, place)
     if isinstance(value, list):
-        return _listed(value, place)
+        _check(value, place)
+        return value
     if isinstance(value, bool | int | float):
         return _number(value, place)
     required = "be a number, a list of numbers, or the name of a CSV or NPY file beside this one"
@@ -39,13 +40,8 @@ def _number(value: Any, place: Place) -> Any:
     return value
 
 
-def _listed(value: list[Any], place: Place) -> np.ndarray:
-    """Nested lists as an array: the first element that does not fit is named."""
-    shape = _check(value, place)
-    return np.array(value).reshape(shape)
-
-
 def _check(value: list[Any], place: Place) -> tuple[int, ...]:
+    """The shape of nested lists; the first element that does not fit is named."""
     if len(place.key) > 40:
         raise place.fault("lists nested that deep", "be a list of numbers, or of rows", "No array has so many axes.")
     shapes = []
