@@ -2,6 +2,7 @@
 
 import ast
 import re
+import sys
 from pathlib import Path
 
 import jax
@@ -84,3 +85,13 @@ def test_what_a_certificate_misses_names_an_argument_with_an_example(kind):
     assert missing
     for line in missing:
         assert re.search(r"\b(?:pass|use|declare|build|state)\b.*(?:=|pc\.\w+\()", line), line
+
+
+def test_command_without_its_packages_says_what_to_install(monkeypatch):
+    from perfcontrol.__main__ import main
+
+    monkeypatch.setitem(sys.modules, "typer", None)
+    for name in [name for name in sys.modules if name.startswith("perfcontrol.cli")]:
+        monkeypatch.delitem(sys.modules, name)
+    with pytest.raises(SystemExit, match=r"needs typer\. Install it with pip install 'perfcontrol\[app\]'"):
+        main()

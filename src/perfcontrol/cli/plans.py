@@ -35,7 +35,10 @@ def plan_in(path: Path, settings: list[str] | None = None, seed: int | None = No
 
     if not path.exists():
         raise fail(
-            "file", f"{path}, which does not exist", "be a problem file", f"`perfcontrol new {path}` writes one."
+            "file",
+            f"{path}, which does not exist",
+            "be a problem file",
+            f"Run `perfcontrol new {path}`, which writes one.",
         )
     document = read_document(path / PROBLEM if path.is_dir() else path)
     plan = plan_of(changed(document, settings or []))
