@@ -295,6 +295,7 @@ WRONG = {
     ),
     "features that are no vector": (lambda: fitted_with(reaction=lambda M: M), "reaction", "vector"),
     "features that are not finite": (lambda: fitted_with(reaction=lambda M: jnp.log(M[0, 0])), "reaction", "finite"),
+    "level in per cent": (lambda: fitted().A.interval(95), "level", "0.95"),
     "no members": (lambda: fitted().ensemble(0, key=jax.random.key(0), cost=COST, horizon=9), "k", "at least 1"),
     "ensemble without a key": (lambda: fitted().ensemble(3, cost=COST, horizon=9), "key", "random key"),
 }
