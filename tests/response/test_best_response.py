@@ -309,3 +309,16 @@ def test_residual_follows_its_definition():
 def test_best_response_refuses_a_policy_of_the_wrong_shape():
     with pytest.raises(pc.InputError, match=r"`deployed` must have shape .*swapped"):
         pc.best_response(make(), jnp.zeros((H, n, m)))
+
+
+@pytest.mark.parametrize("name", ["row sums", "active ball", "active simplex"])
+def test_response_pushforward_without_a_dense_hessian_matches_finite_differences(name, monkeypatch):
+    problem = DIFFERENTIATED[name]()
+    direction = OTHER / jnp.linalg.norm(OTHER)
+    ahead, behind = (answer(problem, DEPLOYED + sign * 1e-5 * direction) for sign in (1, -1))
+    monkeypatch.setattr(importlib.import_module("perfcontrol.response.quadratic"), "DENSE_LIMIT", 1)
+    response = answer(problem, DEPLOYED)
+    pushed = eqx.filter_jit(
+        lambda p, D, R, V: importlib.import_module("perfcontrol.response.respond").response_pushforward(p, D, R)(V)
+    )(problem, DEPLOYED, response, direction)
+    assert_close(pushed, (ahead - behind) / 2e-5, 1e-6)

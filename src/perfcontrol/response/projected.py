@@ -16,6 +16,7 @@ from perfcontrol.sets import AbstractSet, Unconstrained
 
 ACCELERATED_STEPS = 400
 NEWTON_STEPS = 30
+KRYLOV = 30
 
 
 @program
@@ -63,7 +64,7 @@ class Projected:
         """gradient -> the Newton step from near the minimiser M."""
         project, step = self.feasible_set.project, self.step
         if self.form.matrix is None:
-            return lambda gradient: project(M - step * gradient) - M
+            return lambda gradient: _newton_by_products(self.feasible_set, self.form, M, gradient)
         system, _ = _newton_system(self.feasible_set, self.form, M)
         factors = jax.scipy.linalg.lu_factor(system)
 
@@ -77,6 +78,21 @@ class Projected:
         """Φ', (p, p), given 𝐄 = ∂_2 g, (p, p): the Newton step differentiated in its gradient."""
         system, slope = _newton_system(self.feasible_set, self.form, M)
         return -solve(system, self.step * slope @ reaction)
+
+
+def _newton_by_products(feasible_set: AbstractSet, form: Quadratic, M: Array, gradient: Array) -> Array:
+    """The same Newton step by GMRES, where the Hessian is not held."""
+    project, step = feasible_set.project, form.step
+    _, slope = jax.linearize(project, M - step * form.gradient(M))
+    moved, _ = jax.scipy.sparse.linalg.gmres(
+        lambda V: V - slope(V - step * (form.gradient(V) - form.linear)),
+        M - project(M - step * gradient),
+        tol=1e-10 if M.dtype == jnp.float64 else 1e-5,
+        restart=min(KRYLOV, M.size),
+        maxiter=KRYLOV,
+        solve_method="incremental",
+    )
+    return -jnp.asarray(moved)
 
 
 def _newton_system(feasible_set: AbstractSet, form: Quadratic, M: Any) -> tuple[Any, Any]:

@@ -17,6 +17,7 @@ from perfcontrol.evaluate.exact import weigh
 from perfcontrol.evaluate.impulses import impulse_form
 from perfcontrol.evaluate.mean_path import sustained_form
 from perfcontrol.problem import PerformativeProblem
+from perfcontrol.sets import FullStructure
 
 DENSE_LIMIT = 2048  # free parameters up to which the Hessian is held as a matrix
 
@@ -97,7 +98,10 @@ def quadratic(problem: PerformativeProblem, world: World) -> Quadratic:
 
 
 def quadratic_by_passes(problem: PerformativeProblem, world: World) -> Quadratic:
-    """The same without a matrix."""
+    """The same without a matrix: gradients by its factors where there are such, else by a pass over time each."""
+    if stationary(world) and isinstance(problem.structure, FullStructure):
+        form = factors(problem, world)
+        return Quadratic(form.linear, 1 / _power_iteration(form.gradient, form.linear), None, form.gradient)
 
     def gradient(M: Array) -> Array:
         return weigh(problem, world, M)[1]
