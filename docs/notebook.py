@@ -27,7 +27,7 @@ def notebook(markdown: str) -> dict:
     for words, code, prints in blocks(markdown):
         # Equations as notebooks write them; links to other pages of the site lead nowhere from a folder of one's own.
         words = re.sub(r"\\[()]", "$", re.sub(r"\\[\[\]]", "$$", words))
-        words = re.sub(r"\[([^]]+)\]\((?!http)[^)]+\)", r"\1", words).strip()
+        words = re.sub(r"\[([^]]+)\]\((?!http)[^)]+\)(?:\{[^}]*\})?", r"\1", words).strip()
         if words:
             cells.append({"cell_type": "markdown", "id": f"cell-{len(cells)}", "metadata": {}, "source": words})
         if code:
