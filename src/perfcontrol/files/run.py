@@ -144,7 +144,12 @@ def read_run(folder: Path) -> Run:
     """The run in a folder."""
     record = read_record(folder)
     if record.get("kind") != "solve":
-        raise fail("path", f"{folder}, a {record.get('kind')}", "be the folder of a run", "pc.load opens it as a grid.")
+        raise fail(
+            "path",
+            f"{folder}, a {record.get('kind')}",
+            "be the folder of a run",
+            "Pass it to pc.load, which opens it as a grid.",
+        )
     if not record.get("ended"):
         remedy = f"Go on with `perfcontrol resume {folder}`."
         raise fail("path", f"{folder}, a run that has not ended", "be the folder of a finished run", remedy)
