@@ -146,7 +146,7 @@ WRONG = {
     "logs of other signals": (
         lambda: pc.Logs(X, U, DEPLOYED, ["a", "b"]) + pc.Logs(X, U, DEPLOYED, ["b", "a"]),
         "state_names",
-        "Reorder",
+        "order of the other",
     ),
     "missing value in a policy": (lambda: pc.Logs(X, U, with_value(DEPLOYED, (0, 0, 0, 0), np.nan)), "deployed", "nan"),
 }
@@ -167,13 +167,13 @@ def spoil(folder, name: str, old: str, new: str) -> None:
 SPOILED = {
     "missing file": (lambda d: (d / "episode_1.csv").unlink(), "episode_1.csv", "no such file"),
     "no index": (lambda d: (d / "episodes.csv").unlink(), "episodes.csv", "no such file"),
-    "header without time": (lambda d: spoil(d, "episode_0.csv", "t,", "time,"), "episode_0.csv", "Missing: t"),
+    "header without time": (lambda d: spoil(d, "episode_0.csv", "t,", "time,"), "episode_0.csv", "Add t."),
     "gap in time": (lambda d: spoil(d, "episode_2.csv", "\n2,", "\n7,"), "episode_2.csv", "t = 1 then 7 in line 4"),
     "words in a column": (lambda d: spoil(d, "episode_0.csv", "\n1,", "\none,"), "episode_0.csv", "'one' in line 3"),
     "a cell too many": (lambda d: spoil(d, "episode_0.csv", "\n1,", "\n1,2,"), "episode_0.csv", "5 cells in line 3"),
     "unknown policy": (lambda d: spoil(d, "episodes.csv", "episode_0.csv,0", "episode_0.csv,9"), "episodes.csv", "9"),
     "lag left out": (lambda d: spoil(d, "policies.csv", "\n1,1,", "\n1,2,"), "policies.csv", "lags [2.0] of policy 1"),
-    "a signal without its column": (lambda d: spoil(d, "policies.csv", ",x1", ",y"), "episode_0.csv", "Missing: y"),
+    "a signal without its column": (lambda d: spoil(d, "policies.csv", ",x1", ",y"), "episode_0.csv", "Add y."),
     "policies of two shapes": (
         lambda d: (d / "policies.csv").write_text((d / "policies.csv").read_text() + "1,2,u0,0.0,0.0\n"),
         "policies.csv",
