@@ -98,6 +98,7 @@ from perfcontrol.solvers import (
     TwoPoint,
     confidence_region,
     solve,
+    solve_many,
 )
 from perfcontrol.systems import (
     Linearisation,
@@ -247,6 +248,7 @@ __all__ = [
     "save",
     "simulate",
     "solve",
+    "solve_many",
     "state_moments",
     "strong_stability",
     "test_reaction",

@@ -15,12 +15,15 @@ NAME = "lock"
 
 
 @contextmanager
-def locked(argument: str, folder: Path) -> Iterator[None]:
-    """Hold `folder`, made if need be; raises InputError about `argument` where another process holds it."""
+def locked(argument: str, folder: Path, name: str = NAME) -> Iterator[None]:
+    """Hold `folder`, made if need be; raises InputError about `argument` where another process holds it.
+
+    Processes that work in it together each have a `name` of their own.
+    """
     with naming(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    with naming(folder / NAME):
-        file = (folder / NAME).open("a+b")
+    with naming(folder / name):
+        file = (folder / name).open("a+b")
     with file:
         if not _taken(file):
             file.seek(0)

@@ -12,15 +12,16 @@ import xarray
 import perfcontrol as pc
 from perfcontrol import results
 from perfcontrol.config import REGIMES, ReproduceSettings
-from perfcontrol.experiments.batches import in_single_precision
+from perfcontrol.experiments.batches import costs, in_single_precision
 from perfcontrol.experiments.reproduce import Outcome, reproduce
 from perfcontrol.experiments.reproduce import divergence as divergence_stage
 from perfcontrol.experiments.reproduce.cases import CASES, UNSTABLE, problems_of, silent, starts_of
 from perfcontrol.experiments.reproduce.exact import exact_stage
-from perfcontrol.experiments.reproduce.laboratory import constant_step, laboratory
+from perfcontrol.experiments.reproduce.laboratory import constant_step, laboratory, names_of
 from perfcontrol.experiments.reproduce.stages import Stages
 from perfcontrol.plotting import paper_figures
 from perfcontrol.reports.paper import judge, regimes, theorems
+from perfcontrol.solvers.rows import pick
 
 SETTINGS = ReproduceSettings(seeds=3, steps=100, cure_steps=200, sweep_seeds=2, sweep_steps=100)
 STAGES = ("exact", "exact_simplex", "optimum", "runs", "cure", "sweep")
@@ -66,19 +67,19 @@ def test_runs_equal_single_solves_with_the_same_key(done: tuple[Path, Outcome]) 
     assert float(picked["cost"][-1]) == pytest.approx(cost, rel=1e-4)
 
 
-def test_block_of_stopped_runs_repeats_the_last_policy_and_its_cost() -> None:
+def test_stopped_runs_repeat_the_last_policy_and_its_cost() -> None:
     problems = problems_of(SETTINGS, "rows")
     lab = laboratory(SETTINGS, problems, xarray.Dataset())
-    case, seed = np.full(3, UNSTABLE), np.arange(3)
-    runs = lab.runs(5, case, seed, seed, constant_step(10.0))
-    (ended,) = lab.runner.run(runs, 300, lambda share: None)
-    assert "success" not in ended.result
-    assert ended.steps_taken.max() < 100, "stopped within the first compiled call"
-    assert np.all(ended.policies[:, 100:] == ended.policies[:, 99:100])
-    cost = lab.runner.costs(runs, ended)
-    assert np.all(cost[:, 100:] == cost[:, 99:100])
-    first = float(pc.expected_cost(problems[UNSTABLE], runs.start[0]))
-    assert float(cost[0, 0]) == pytest.approx(first, rel=1e-4)
+    case, steps = np.array([UNSTABLE]), 300
+    solution = lab.run(case, 5, np.arange(3)[None], constant_step(10.0), steps, lambda share: None)
+    assert set(names_of(solution).flat) <= {"diverged", "nonfinite"}
+    assert solution.steps.max() < 100, "stopped within the first compiled call"
+    policies = np.asarray(solution.history)
+    assert np.all(policies[:, :, 100:] == policies[:, :, 99:100])
+    cost = costs(pick(lab.problems, case), policies, np.asarray(solution.steps))
+    assert np.all(cost[:, :, 100:] == cost[:, :, 99:100])
+    first = float(pc.expected_cost(problems[UNSTABLE], lab.starts[0]))
+    assert float(cost[0, 0, 0]) == pytest.approx(first, rel=1e-4)
 
 
 def test_smaller_step_ends_on_the_floor_that_the_theory_gives(done: tuple[Path, Outcome]) -> None:

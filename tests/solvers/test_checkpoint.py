@@ -12,7 +12,7 @@ import pytest
 
 import perfcontrol as pc
 from perfcontrol._lock import locked
-from perfcontrol.solvers import checkpoint, history
+from perfcontrol.solvers import checkpoint, history, run_folder
 from perfcontrol.solvers.runs import CHUNK
 from tests.solvers.problems import drifting, performative_prediction, steered, strongly_performative
 from tests.solvers.test_solve import Walk
@@ -245,7 +245,7 @@ def test_run_begun_with_other_versions_is_not_continued_but_its_answer_is_read(t
     content["versions"]["jaxlib"] = "0.0.1"
     (folder / "run.json").write_text(json.dumps(content))
     assert_refused(lambda: finished(folder), "checkpoint", "jaxlib 0.0.1")
-    content["versions"] = checkpoint._versions()
+    content["versions"] = run_folder._versions()
     (folder / "run.json").write_text(json.dumps(content))
     first = finished(folder)
     content["versions"] = {}

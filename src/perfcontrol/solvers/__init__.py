@@ -6,6 +6,7 @@ from perfcontrol.solvers.confidence import ConfidenceRegion, confidence_region
 from perfcontrol.solvers.continuation import Continuation
 from perfcontrol.solvers.estimated_dynamics import EstimatedDynamics
 from perfcontrol.solvers.gradients import AbstractGradient, Exact, Pathwise
+from perfcontrol.solvers.many import solve_many
 from perfcontrol.solvers.optimum import PerformativeOptimum
 from perfcontrol.solvers.result import Result
 from perfcontrol.solvers.rrm import RRM
@@ -39,4 +40,5 @@ __all__ = [
     "TwoPoint",
     "confidence_region",
     "solve",
+    "solve_many",
 ]

@@ -58,7 +58,7 @@ def described(run: Run) -> tuple[dict[str, Any], Any]:
     return parts, jax.eval_shape(lambda M: record_of(run.record, M), run.M0)
 
 
-def _run(
+def run_steps(
     solver: AbstractSolver,
     problem: PerformativeProblem,
     state: State,
@@ -68,7 +68,7 @@ def _run(
     record: Record,
     every: int,
 ) -> tuple[State, Any]:
-    """`count` iterations, a multiple of `every`, recorded after each `every`; ended runs stay as they are."""
+    """`count` iterations from iteration `first` on, recorded after each `every`; pure. Ended runs stay as they are."""
 
     def iterate(state: State, n: Array) -> State:
         step_key = None if key is None else jax.random.fold_in(key, n)
@@ -86,14 +86,7 @@ def _run(
     return jax.lax.scan(block, state, jnp.arange(count // every))
 
 
-def run_steps(
-    solver: AbstractSolver, problem: PerformativeProblem, state: State, key: Array | None, first: Array, count: int
-) -> tuple[State, Array]:
-    """`count` iterations from iteration `first` on, and the iterate after each; pure, for batched runs of one's own."""
-    return _run(solver, problem, state, key, first, count, identity, 1)
-
-
-_compiled_run = program(_run, on_device=True)
+_compiled_run = program(run_steps, on_device=True)
 _compiled_record = program(record_of)
 _compiled_init = program(lambda solver, problem, M0: solver.init(problem, M0), on_device=True)
 
@@ -104,10 +97,10 @@ def traced(run: Run) -> tuple[State, Any]:
     state = solver.init(problem, M0)
     history = [jax.tree.map(lambda leaf: leaf[None], record_of(record, M0))]
     whole = total - total % every
-    state, kept = _run(solver, problem, state, key, 0, whole, record, every)
+    state, kept = run_steps(solver, problem, state, key, 0, whole, record, every)
     history.append(kept)
     if total % every:
-        state, _ = _run(solver, problem, state, key, whole, total % every, _nothing, 1)
+        state, _ = run_steps(solver, problem, state, key, whole, total % every, _nothing, 1)
     return state, joined(history)
 
 

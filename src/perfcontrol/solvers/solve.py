@@ -92,7 +92,7 @@ def solve(
 
 def check_feasible(name: str, problem: PerformativeProblem, M: Array) -> None:
     """Raise unless a known policy lies in the feasible set."""
-    if not bool(problem.feasible_set.contains(M, _slack(M))):
+    if not bool(problem.feasible_set.contains(M, slack(M))):
         raise fail(
             name,
             f"a policy {float(jnp.linalg.norm(M - problem.feasible_set.project(M))):.3g} away",
@@ -129,5 +129,6 @@ def _rescued(failed: Solution, rescue: Solution) -> Solution:
     return Solution(rescue.M, rescue.result, failed.steps + rescue.steps, failed.history, stats)
 
 
-def _slack(M: Array) -> float:
+def slack(M: Array) -> float:
+    """How far outside of the set rounding may put a policy."""
     return 1e-8 if M.dtype == jnp.float64 else 1e-4

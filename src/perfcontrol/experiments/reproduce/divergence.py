@@ -1,5 +1,6 @@
 """The unstable regime again: what cures its divergence, what does not, and where it begins."""
 
+import math
 from typing import Any
 
 import numpy as np
@@ -7,7 +8,7 @@ import xarray
 
 from perfcontrol.config import ReproduceSettings
 from perfcontrol.experiments.reproduce.cases import UNSTABLE, Progress, problems_of
-from perfcontrol.experiments.reproduce.laboratory import Laboratory, constant_step, diminishing_step
+from perfcontrol.experiments.reproduce.laboratory import Laboratory, constant_step, diminishing_step, names_of
 from perfcontrol.experiments.stock import HORIZON, ORDERS
 from perfcontrol.theory import MeanSquareStability, mean_square_stability
 
@@ -23,8 +24,8 @@ def cure_stage(
     lab: Laboratory, bounded: Laboratory | None, settings: ReproduceSettings, progress: Progress
 ) -> xarray.Dataset:
     """The unstable regime again: with a diminishing step, with a smaller one, and on the bounded simplex."""
-    shape = (len(ORDERS), settings.cure_seeds)
-    order, seed = np.indices(shape).reshape(2, -1)
+    cases = UNSTABLE + np.arange(len(ORDERS))
+    stream = np.arange(len(ORDERS) * settings.cure_seeds).reshape(len(ORDERS), -1)
     step = settings.step_size
     plans = {
         "diminishing": (lab, diminishing_step(step), settings.cure_steps),
@@ -39,11 +40,8 @@ def cure_stage(
         def show(share: float, before: int = before, steps: int = steps) -> None:
             progress("what cures divergence", (before + share * steps) / total)
 
-        runs = place.runs(3, UNSTABLE + order, np.arange(order.size), seed, rule)
-        errors = np.empty((order.size, steps + 1))
-        for ended in place.runner.run(runs, steps, show):
-            errors[ended.rows] = place.errors(runs, ended)
-        data[name] = (("order", "seed", f"step_{name}"), errors[:, 1:].reshape(*shape, steps))
+        errors = place.errors(cases, place.run(cases, 3, stream, rule, steps, show))
+        data[name] = (("order", "seed", f"step_{name}"), errors[..., 1:])
         data[f"step_{name}"] = ((f"step_{name}",), np.arange(1, steps + 1))
         before += steps
     data["floor_smaller"] = (("order",), error_floors(settings, lab.exact, SMALL_STEP * step))
@@ -54,19 +52,23 @@ def sweep_stage(lab: Laboratory, settings: ReproduceSettings, progress: Progress
     """Constant steps around the mean-square thresholds of the unstable regime: which runs do not come closer."""
     factors = np.asarray(SWEEP_FACTORS)
     grid = (len(ORDERS), len(factors), settings.sweep_seeds)
-    order, factor, seed = np.indices(grid).reshape(3, -1)
+    stream = np.arange(math.prod(grid)).reshape(grid)
     threshold = mean_square_thresholds(settings, lab.exact)
-    rule = constant_step(threshold[order] * factors[factor])
-    runs = lab.runs(4, UNSTABLE + order, np.arange(order.size), seed, rule)
-    relative, result = np.empty(order.size), np.empty(order.size, dtype="<U9")
-    for ended in lab.runner.run(runs, settings.sweep_steps, lambda share: progress("where divergence begins", share)):
-        error = lab.errors(runs, ended)
-        relative[ended.rows], result[ended.rows] = error[:, -1] / error[:, 0], ended.result
+    relative, result = np.empty(grid), np.empty(grid, dtype="<U9")
+    for order in range(len(ORDERS)):
+
+        def show(share: float, before: int = order) -> None:
+            progress("where divergence begins", (before + share) / len(ORDERS))
+
+        rules = [constant_step(threshold[order] * factor) for factor in factors]
+        solution = lab.run(UNSTABLE + order, 4, stream[order], rules, settings.sweep_steps, show)
+        error = lab.errors(UNSTABLE + order, solution)
+        relative[order], result[order] = error[..., -1] / error[..., 0], names_of(solution)
     return xarray.Dataset(
         {
-            "relative_error": (("order", "factor", "seed"), relative.reshape(grid)),
+            "relative_error": (("order", "factor", "seed"), relative),
             "threshold": (("order",), threshold),
-            "result": (("order", "factor", "seed"), result.reshape(grid)),
+            "result": (("order", "factor", "seed"), result),
         },
         coords={"order": list(ORDERS), "factor": factors, "seed": np.arange(settings.sweep_seeds)},
     )

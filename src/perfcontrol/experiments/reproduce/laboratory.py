@@ -1,70 +1,103 @@
 """The paper's runs: what all stages with runs share, and RSGD in every case."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import xarray
+from jaxtyping import Array
 
 from perfcontrol.config import REGIMES, ReproduceSettings
-from perfcontrol.experiments.batches import CEILING, Ended, Runner, Runs, StepRule, stack_problems
+from perfcontrol.experiments.batches import CEILING, StepRule, costs, in_single_precision
 from perfcontrol.experiments.reproduce.cases import CASES, Progress, starts_of
 from perfcontrol.experiments.stock import HORIZON, ORDERS
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.random_keys import fast_key
+from perfcontrol.solvers import RSGD, Solution, solve_many
+from perfcontrol.solvers.result import MEMBERS
+from perfcontrol.solvers.rows import pick
+from perfcontrol.solvers.runs import identity
 
 DIMINISHING_OFFSET = 10.0  # η_n = step 10 / (n + 10)
 
 
 class Laboratory(NamedTuple):
-    """What the stages with runs share: the compiled runner of a feasible set, its stable policies, the starts."""
+    """What the stages with runs share: the problems of a feasible set, their stable policies, starts, random numbers.
 
-    runner: Runner
+    Runs are in single precision: its rounding is far below their sampling noise, and they take half the time.
+    """
+
+    problems: PerformativeProblem  # stacked
     exact: xarray.Dataset
-    starts: np.ndarray
+    starts: Array  # (seeds, 1, stocks, stocks)
+    root: Array
 
-    def runs(self, stage: int, case: np.ndarray, stream: np.ndarray, seed: np.ndarray, step: StepRule) -> Runs:
-        """One run for each entry of the index arrays; `stage` keeps the random numbers of stages apart."""
-        rule = jax.tree.map(lambda value: np.broadcast_to(np.float32(value), case.shape), step)
-        return Runs(case, stage * 1_000_000 + stream, self.starts[seed], rule)
+    def run(
+        self, cases: Any, stage: int, stream: np.ndarray, rules: Any, steps: int, show: Callable[[float], None]
+    ) -> Solution:
+        """RSGD in some cases, or one; `stream` has the axes of the answer, the last one the seeds, and with `stage`
+        says which random numbers each run uses.
+        """
+        keys = jax.vmap(lambda number: jax.random.fold_in(self.root, number))(stage * 1_000_000 + stream.reshape(-1))
+        solvers = [RSGD(1, rule) for rule in rules] if isinstance(rules, list) else RSGD(1, rules)
+        starts = self.starts[: stream.shape[-1]].reshape(*(1,) * (stream.ndim - 1), -1, *self.starts.shape[1:])
+        return solve_many(
+            pick(self.problems, cases),
+            solvers,
+            starts,
+            keys=keys.reshape(stream.shape),
+            max_steps=steps,  # so that stages of other lengths need not be compiled anew
+            record=identity,
+            progress=lambda done, total: show(done / total),
+        )
 
-    def errors(self, runs: Runs, ended: Ended) -> np.ndarray:
-        """‖M_n - M^PS‖²_F, (rows, steps+1)."""
-        stable = self.exact["M"].values.reshape(-1, *ended.policies.shape[-2:])[runs.case[ended.rows]]
-        return np.sum((ended.policies[:, :, 0] - stable[:, None]) ** 2, axis=(-2, -1))
+    def errors(self, cases: Any, solution: Solution) -> np.ndarray:
+        """‖M_n - M^PS‖²_F, with the axes of the runs and one of steps."""
+        policies = np.asarray(solution.history)[..., 0, :, :]
+        stable = self.exact["M"].values.reshape(-1, 1, 1, *policies.shape[-2:])[cases]
+        return np.sum((policies - stable) ** 2, axis=(-2, -1))
 
 
 def laboratory(settings: ReproduceSettings, problems: list[PerformativeProblem], exact: xarray.Dataset) -> Laboratory:
     """The laboratory of one feasible set."""
+    stacked = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *problems)
     seeds = max(settings.seeds, settings.cure_seeds, settings.sweep_seeds)
     starts = starts_of(settings, problems[0], seeds).astype(np.float32)
-    return Laboratory(Runner(stack_problems(problems), fast_key(settings.seed)), exact, starts)
+    return Laboratory(in_single_precision(stacked), exact, jnp.asarray(starts), fast_key(settings.seed))
 
 
 def constant_step(step: Any) -> StepRule:
     """A step on the stage average, the same in every iteration."""
-    return StepRule(step / HORIZON, 0.0, 1.0)
+    return StepRule(np.float32(step / HORIZON), np.float32(0), np.float32(1))
 
 
 def diminishing_step(step: float) -> StepRule:
     """A step on the stage average that falls like 1/n."""
-    return StepRule(0.0, step / HORIZON * DIMINISHING_OFFSET, DIMINISHING_OFFSET)
+    rising = np.float32(step / HORIZON * DIMINISHING_OFFSET)
+    return StepRule(np.float32(0), rising, np.float32(DIMINISHING_OFFSET))
+
+
+def names_of(solution: Solution) -> np.ndarray:
+    """How each run ended, in a word."""
+    names = np.empty(solution.steps.shape, dtype="<U9")
+    for name, member in MEMBERS.items():
+        names[np.asarray(solution.result == member)] = name
+    return names
 
 
 def run_stage(lab: Laboratory, settings: ReproduceSettings, progress: Progress) -> xarray.Dataset:
     """The paper's RSGD: error and exact cost of every iterate."""
     seeds, length = settings.seeds, settings.steps + 1
     shape = (len(REGIMES), len(ORDERS), seeds)
-    regime, order, seed = np.indices(shape).reshape(3, -1)
+    cases = np.arange(len(REGIMES) * len(ORDERS))
     # Regimes share their random numbers: what differs between the panels is the regime.
-    case, stream = regime * len(ORDERS) + order, order * seeds + seed
-    runs = lab.runs(2, case, stream, seed, constant_step(settings.step_size))
-    error, cost = np.empty((2, case.size, length))
-    result, taken = np.empty(case.size, dtype="<U9"), np.empty(case.size, dtype=int)
-    for ended in lab.runner.run(runs, settings.steps, lambda share: progress("RSGD runs", share)):
-        error[ended.rows] = lab.errors(runs, ended)
-        cost[ended.rows] = lab.runner.costs(runs, ended)
-        result[ended.rows], taken[ended.rows] = ended.result, ended.steps_taken
+    stream = cases[:, None] % len(ORDERS) * seeds + np.arange(seeds)
+    rule = constant_step(settings.step_size)
+    solution = lab.run(cases, 2, stream, rule, settings.steps, lambda share: progress("RSGD runs", share))
+    taken = np.asarray(solution.steps)
+    error, cost = lab.errors(cases, solution), costs(lab.problems, np.asarray(solution.history), taken)
     dims = ("regime", "order", "seed")
     per_step = ((*dims, "step"), (*shape, length))
     data = {
@@ -74,7 +107,7 @@ def run_stage(lab: Laboratory, settings: ReproduceSettings, progress: Progress) 
             cost.reshape(per_step[1]),
             {"long_name": f"expected total cost C_T(M_n; M_n), exact to single precision, at most {CEILING:g}"},
         ),
-        "result": (dims, result.reshape(shape), {"long_name": "how the run ended"}),
+        "result": (dims, names_of(solution).reshape(shape), {"long_name": "how the run ended"}),
         "steps_taken": (dims, taken.reshape(shape), {"long_name": "iterations until the run ended"}),
         "stable_policy": (("regime", "order", "row", "column"), lab.exact["M"].values),
         "stable_cost": (("regime", "order"), lab.exact["cost"].values),
