@@ -56,7 +56,7 @@ def test_runs_equal_single_solves_with_the_same_key(done: tuple[Path, Outcome]) 
     order, seed = 1, 2
     problem = pc.experiments.stock_market("descending", growth=REGIMES["stable"])
     single = in_single_precision(problem)
-    key = jax.random.fold_in(jax.random.key(SETTINGS.seed), 2_000_000 + order * SETTINGS.seeds + seed)
+    key = jax.random.fold_in(pc.fast_key(SETTINGS.seed), 2_000_000 + order * SETTINGS.seeds + seed)
     M0 = starts_of(SETTINGS, problem, SETTINGS.seeds)[seed].astype(np.float32)
     solution = pc.solve(single, pc.RSGD(SETTINGS.steps, SETTINGS.step_size / 60), M0, key=key)
     stable = runs["stable_policy"].sel(regime="stable", order="descending").values
