@@ -105,7 +105,7 @@ def _keys(keys: Any, axes: tuple[int, ...]) -> Array | None:
     if keys.ndim <= 1:
         return keys
     if keys.ndim != len(axes) + 1 or any(k not in (1, a) for k, a in zip(keys.shape, axes, strict=False)):
-        raise fail("keys", f"shape {keys.shape}", required, "An axis of length 1 shares its keys.")
+        raise fail("keys", f"shape {keys.shape}", required, "Pass an axis of length 1 where keys are shared.")
     return jnp.broadcast_to(keys, (*axes, keys.shape[-1]))
 
 
@@ -121,6 +121,6 @@ def _starts(problems: PerformativeProblem, M0: Any, axes: tuple[int, ...]) -> Ar
             "M0",
             f"shape {M0.shape}",
             f"be one policy, {shape}, or have shape {(*axes, *shape)}",
-            "An axis of length 1 shares its starts.",
+            "Pass an axis of length 1 where starts are shared.",
         )
     return jnp.broadcast_to(M0, (*axes, *shape)).reshape(-1, *shape).astype(problems.dtype)
