@@ -171,8 +171,15 @@ def check_symmetric_psd(name: str, array: Array, remedy: str) -> None:
     if not is_concrete(array):
         return
     host = np.asarray(array, dtype=float)
-    scale = np.max(np.abs(host), initial=0.0)
-    slack = 100 * float(np.finfo(np.asarray(array).dtype).eps) * max(scale, np.finfo(float).tiny) * host.shape[-1]
+    scale, precision = np.max(np.abs(host), initial=0.0), np.finfo(np.asarray(array).dtype)
+    if 0 < scale < float(precision.tiny):
+        raise fail(
+            name,
+            f"entries of at most {scale:.3g}",
+            f"be zero, or have an entry above {float(precision.tiny):.3g}: smaller ones count as zero when compiled",
+            "Choose larger units.",
+        )
+    slack = 100 * float(precision.eps) * max(scale, np.finfo(float).tiny) * host.shape[-1]
     asymmetry = float(np.max(np.abs(host - np.swapaxes(host, -1, -2)), initial=0.0))
     if asymmetry > slack:
         raise fail(

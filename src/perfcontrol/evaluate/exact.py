@@ -131,7 +131,8 @@ def expected_gradient(problem: PerformativeProblem, M: Any, *, deployed: Any = N
         Shape `problem.policy_shape`.
 
     Raises:
-        InputError: as `expected_cost`; `total=True` together with another deployed policy.
+        InputError: as `expected_cost`; `total=True` together with another deployed policy, or where the reaction has
+            no finite derivative.
     """
     M, reacting = check_pair(problem, M, deployed)
     require_moments(problem)
@@ -144,4 +145,17 @@ def expected_gradient(problem: PerformativeProblem, M: Any, *, deployed: Any = N
             "be left out for the total gradient",
             "Leave it out: the total derivative moves both policies together.",
         )
-    return check_answer("the total gradient", value_and_total_gradient(problem, M)[1], problem, M)
+    cost, gradient = value_and_total_gradient(problem, M)
+    if known(cost, gradient) and np.isfinite(cost) and not np.all(np.isfinite(gradient)) and _calm(problem, M):
+        raise fail(
+            "perturbation",
+            "a reaction whose derivative is not finite at this policy",
+            "have a derivative by the policy where the total gradient is asked for",
+            "Write norms as pc.Norm; jnp.linalg.norm has no derivative at zero.",
+        )
+    return check_answer("the total gradient", gradient, problem, M)
+
+
+def _calm(problem: PerformativeProblem, M: Any) -> bool:
+    """Whether the derivative in the evaluated policy alone is finite, so that nothing overflows but the reaction's."""
+    return bool(np.all(np.isfinite(exact_gradient(problem, M, M))))

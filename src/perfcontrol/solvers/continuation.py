@@ -121,6 +121,8 @@ class Continuation(AbstractExactSolver):
         length = xp.where(good, xp.where(first, FIRST * scale, longer), own.length / 2)
         stuck = ~good & (first | (length < SHORTEST * scale))
         ended = choose(arrived | stuck, Result.success, Result.running)  # `finish` tells which by the residual
+        missing = stuck & xp.all(xp.isfinite(y)) & ~xp.all(xp.isfinite(slope))
+        ended = choose(missing, Result.not_differentiable, ended)
         # At a kink the curve may turn so sharply that no step along the old tangent meets it: try that of the far side.
         far_side, _ = _tangent(opening, border, end)
         turns = short & ~last & xp.all(xp.isfinite(far_side))
@@ -138,6 +140,7 @@ class Continuation(AbstractExactSolver):
         unfinished = Result.running if stopped else Result.not_converged
         arrived = (own.level >= 1) & (residual <= self.accuracy(problem))
         stats = {"residual": residual, "unique": own.unique, "level": own.level}
+        unfinished = choose(state.result == Result.not_differentiable, Result.not_differentiable, unfinished)
         return choose(arrived, Result.success, unfinished), stats
 
 

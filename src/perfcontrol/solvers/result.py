@@ -20,6 +20,10 @@ class Result(eqx.Enumeration):
         "The sample reached its limit before the standard error met the tolerance; the policy is returned with its "
         "error: raise tolerance, or pass sampling=pc.SampleAverage(limit=...)."
     )
+    not_differentiable = (
+        "The reaction has no finite derivative at a policy on the way, such as that of jnp.linalg.norm at zero: write "
+        "norms as pc.Norm, roots and quotients so that their derivatives are finite, or start from another M0."
+    )
     not_converged = (
         "The tolerance was not reached. The map may have no fixed point, or the method starts too far from one: try "
         "pc.StablePoint where repeated minimisation was used, another M0, pc.Continuation, or a larger tolerance."
@@ -28,7 +32,7 @@ class Result(eqx.Enumeration):
 
 MEMBERS = {
     name: getattr(Result, name)
-    for name in ("success", "running", "diverged", "nonfinite", "undersampled", "not_converged")
+    for name in ("success", "running", "diverged", "nonfinite", "undersampled", "not_differentiable", "not_converged")
 }
 
 
