@@ -70,6 +70,9 @@ def test_errors_of_the_operating_system_are_said_in_words(error, words, capsys):
     [
         (OSError(28, "No space left on device"), 1, "error: cannot go on: the disk is full."),  # as of a full stdout
         (fail("growth", "nan", "be finite", "Pass a number."), 2, "error: `growth` must be finite; got nan."),
+        (MemoryError("Unable to allocate 8 TiB"), 1, "error: there is not enough memory for this: Unable to allocate"),
+        (RuntimeError("RESOURCE_EXHAUSTED: Out of memory"), 1, "error: there is not enough memory for this"),
+        (OverflowError("the cost overflows float64"), 1, "error: the cost overflows float64"),
     ],
 )
 def test_no_command_ends_in_a_traceback_of_what_system_or_library_refuse(error, status, words):
