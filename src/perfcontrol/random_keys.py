@@ -123,7 +123,9 @@ def fast_key(seed: Any) -> Key[Array, ""]:
     References:
         B. Widynski, *Squares: a fast counter-based RNG*, arXiv:2004.06278; the keys are this module's own.
 
-    >>> jax.random.uniform(fast_key(0), (2,)).shape
+    >>> import jax
+    >>> import perfcontrol as pc
+    >>> jax.random.uniform(pc.fast_key(0), (2,)).shape
     (2,)
     """
     whole = seed if isinstance(seed, jax.Array) else np.asarray(seed)
