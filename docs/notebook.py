@@ -8,6 +8,9 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+
 PAGE = "tutorial.md"
 CELL = re.compile(r"^```python\n(?P<code>.*?)^```\n(?:\n```text\n(?P<prints>.*?)^```\n)?", re.MULTILINE | re.DOTALL)
 
@@ -38,8 +41,9 @@ def notebook(markdown: str) -> dict:
     return {"cells": cells, "metadata": {"kernelspec": kernel}, "nbformat": 4, "nbformat_minor": 5}
 
 
-def on_post_build(config, **_) -> None:
-    """Put the notebook beside its page."""
-    page = (Path(config["docs_dir"]) / PAGE).read_text(encoding="utf-8")
-    target = Path(config["site_dir"]) / PAGE.replace(".md", ".ipynb")
-    target.write_text(json.dumps(notebook(page), indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+def on_files(files: Files, *, config: MkDocsConfig, **_) -> Files:
+    """Put the notebook beside its page, where links find it."""
+    page = (Path(config.docs_dir) / PAGE).read_text(encoding="utf-8")
+    content = json.dumps(notebook(page), indent=1, ensure_ascii=False) + "\n"
+    files.append(File.generated(config, PAGE.replace(".md", ".ipynb"), content=content))
+    return files
