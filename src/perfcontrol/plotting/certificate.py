@@ -10,6 +10,8 @@ from perfcontrol.plotting.style import LOOKS, styled
 from perfcontrol.plotting.subjects import panels
 from perfcontrol.theory import Certificate, Sharp
 
+BARS = 200
+
 
 def plot_certificate(certificate: Certificate, *, ax: Any = None) -> Axes:
     """What each sensitivity ε_t adds to the left side of a certificate; of the sharp one what each reaction Δ_t adds.
@@ -33,7 +35,11 @@ def plot_certificate(certificate: Certificate, *, ax: Any = None) -> Axes:
         axes = panels(ax, 1, (4.2, 2.8))[0]
         t = np.arange(len(shares))
         label = r"contribution of $\Delta_t$" if certificate.kind == Sharp.name else r"contribution of $\varepsilon_t$"
-        axes.bar(t, shares, width=0.85, color=LOOKS["optimal"].colour, alpha=0.6)
+        colour = LOOKS["optimal"].colour
+        if len(t) <= BARS:
+            axes.bar(t, shares, width=0.85, color=colour, alpha=0.6)
+        else:  # one outline in place of thousands of bars
+            axes.stairs(shares, np.append(t, len(t)) - 0.5, fill=True, color=colour, alpha=0.6)
         axes.set_axisbelow(True)
         axes.set_xlim(-0.7, len(shares) - 0.3)
         axes.set_xlabel("time $t$")

@@ -13,6 +13,7 @@ from perfcontrol.plotting.subjects import as_paths, input_names, panels, plain, 
 from perfcontrol.problem import PerformativeProblem
 
 MOST = 6  # signals shown unless they are named
+STEPS = 400  # drawn at most
 
 
 def plot_trajectories(
@@ -27,6 +28,8 @@ def plot_trajectories(
     ax: Any = None,
 ) -> np.ndarray:
     """States and inputs over time under each policy in the world that it makes: the median, and the band of most paths.
+
+    Of more than 400 time steps so many are drawn, evenly spaced.
 
     Args:
         problem: the problem.
@@ -73,7 +76,8 @@ def plot_trajectories(
 
 def _signal(axes: Axes, values: np.ndarray, band: float, policy: str, look: Look) -> None:
     low, middle, high = np.quantile(values, [(1 - band) / 2, 0.5, (1 + band) / 2], axis=0)
-    t = np.arange(len(middle))
+    t = np.unique(np.linspace(0, len(middle) - 1, min(len(middle), STEPS)).astype(int))
+    low, middle, high = low[t], middle[t], high[t]
     axes.fill_between(t, low, high, color=look.colour, alpha=0.07, linewidth=0)
     axes.plot(t, middle, color=look.colour, linestyle=look.line, linewidth=1.1, label=plain(policy))
     for edge in (low, high):  # shades that lie over one another tell nobody apart
