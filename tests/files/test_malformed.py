@@ -110,7 +110,7 @@ FILES = {
     "number among rows": (change("[0.0, 0.4]", "0.4"), 5, ["`system.A[1]`", "a number after shape (2,)"]),
     "not square": (change("[[0.5, 0.1], [0.0, 0.4]]", "[[0.5, 0.1]]"), 5, ["`system.A` must have shape", "(1, 2)"]),
     "transposed": (change("[[1.0], [0.5]]", "[[1.0, 0.5]]"), 6, ["`system.B`", "swapped"]),
-    "vector for a matrix": (change("[[1.0], [0.5]]", "[1.0, 0.5]"), 6, ["`system.B`", "A single input needs a column"]),
+    "vector for a matrix": (change("[[1.0], [0.5]]", "[1.0, 0.5]"), 6, ["`system.B`", "single input as a column"]),
     "law of another dimension": (change("mean = [0.0, 0.0]", "mean = [0.0]"), 11, ["`noise.covariance`", "(1, 1)"]),
     "cost of another dimension": (change("R = [[1.0]]", "R = [[1.0, 0.0], [0.0, 1.0]]"), 16, ["`cost.R`", "(1, 1)"]),
     "direction without its axis": (

@@ -59,6 +59,7 @@ def violation(problem: pc.PerformativeProblem, M: jax.Array) -> float:
     return float((g @ M.reshape(-1) + radius * jnp.linalg.norm(g)) / (1 + radius * jnp.linalg.norm(g)))
 
 
+@pytest.mark.slow
 def test_continuation_satisfies_the_variational_inequality_where_the_mean_reacts_strongly():
     lost = 0
     for seed in range(0, 60, 3):
@@ -74,7 +75,10 @@ def test_continuation_satisfies_the_variational_inequality_where_the_mean_reacts
     assert lost > 0, "these problems should be too hard for Newton's method alone"
 
 
-@pytest.mark.parametrize("seed", [12, 18, 48])
+SLOW = [pytest.param(seed, marks=pytest.mark.slow) for seed in (12, 48)]
+
+
+@pytest.mark.parametrize("seed", [18, *SLOW])
 def test_continuation_passes_the_kinks_of_a_box_where_the_curve_turns_sharply(seed):
     """At 12 and 48 no step along the tangent of the near side meets the curve beyond the kink."""
     limit = 0.3
