@@ -7,8 +7,9 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+LONG = ("from-data.md",)  # two hundred resampled plants
 SNIPPETS = [
-    pytest.param(block, id=f"{page.name}-{number}")
+    pytest.param(block, id=f"{page.name}-{number}", marks=[pytest.mark.slow] if page.name in LONG else [])
     for page in PAGES[1:]
     if page.name != "tutorial.md"  # its blocks build on one another: tests/test_docs.py
     for number, block in enumerate(re.findall(r"^```python\n(.*?)^```", page.read_text("utf-8"), re.M | re.S))

@@ -160,7 +160,8 @@ def declared(feasible_set, scale, directions=1):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("feasible_set", [pc.Unconstrained(), pytest.param(pc.Box(-0.4, 0.3), marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("feasible_set", [pc.Unconstrained(), pc.Box(-0.4, 0.3)])
 def test_a_function_declared_convex_gives_the_interval_of_the_same_norm(feasible_set):
     known = pc.optimality_bound(declared(feasible_set, pc.Norm([0.2], [0.6], squared=True)))
     told = pc.optimality_bound(
