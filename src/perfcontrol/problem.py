@@ -276,12 +276,7 @@ class PerformativeProblem(Printed, eqx.Module):
 
 def _zero_gain(gain: Array, m: int, n: int) -> Array:
     if not isinstance(gain, jax.core.Tracer) and float(gain) != 0:
-        raise fail(
-            "gain",
-            f"the number {float(gain)}",
-            f"have shape (m, n) = ({m}, {n})",
-            "Pass a matrix (m, n); only 0 stands for none.",
-        )
+        raise fail("gain", f"the number {float(gain)}", f"have shape (m, n) = ({m}, {n})", "Pass a matrix; 0 is none.")
     return jnp.zeros((m, n), gain.dtype)
 
 
