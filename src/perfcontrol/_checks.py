@@ -52,6 +52,8 @@ def check_instance(name: str, value: Any, kind: type, example: str) -> Any:
         check_parentheses(name, value, required)
     got = f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
     remedy = f"Build one, or subclass `pc.{kind.__name__}`." if inspect.isabstract(kind) else "Build one."
+    if kind.__name__ == "LinearSystem" and type(value).__module__.startswith(("control.", "scipy.signal")):
+        remedy = f"Pass {name}=pc.interop.from_control(plant)."
     raise fail(name, "None" if value is None else got, required, remedy)
 
 
@@ -79,7 +81,9 @@ def as_array(name: str, value: Any, remedy: str = "") -> Array:
                 name,
                 "None" if value is None else f"{type(value).__name__} ({error})",
                 "be an array of real numbers",
-                "Pass a number, a rectangular nested list, a NumPy array or a JAX array.",
+                "Pass solution.M."
+                if type(value).__name__ == "Solution"
+                else "Pass a number, a rectangular nested list, a NumPy array or a JAX array.",
             ) from error
         if host.dtype == np.float64 and not jax.config.jax_enable_x64 and not _warned_about_precision:  # type: ignore[attr-defined]
             _warned_about_precision = True

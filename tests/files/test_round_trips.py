@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.linalg
 
 import perfcontrol as pc
 from perfcontrol._fingerprint import fingerprint
@@ -172,8 +173,41 @@ def test_every_public_class_is_in_a_file_or_in_a_list_of_reasons():
     reasons = set.union(*ELSEWHERE.values(), IN_PYTHON_ONLY)
     rows = {name for name in ROWS if name in classes}
     assert rows | reasons == classes and not rows & reasons
-    assert set(ROWS) == set(PROBLEMS) | set(SOLVERS)
-    assert set(ROWS) - rows == {"LinearSystem.diagonal", "stock_market", "market"}
+    assert set(ROWS) - {"design_gain"} == set(PROBLEMS) | set(SOLVERS)  # a gain comes back as a matrix
+    assert set(ROWS) - rows == {"LinearSystem.diagonal", "design_gain", "stock_market", "market"}
+
+
+DESIGNED = """
+horizon = 5
+gain = { type = "design_gain", Q = [[1.0, 0.0], [0.0, 2.0]], R = [[0.1]] }
+system = { A = [[1.2, 0.1], [0.0, 0.5]], B = [[1.0], [0.5]] }
+noise = { type = "Uniform", low = -1.0, high = 1.0 }
+cost = { type = "QuadraticCost", Q = [[1.0, 0.0], [0.0, 1.0]], R = [[1.0]] }
+"""
+
+
+def test_gain_that_a_file_designs_is_that_of_scipy(tmp_path):
+    path = tmp_path / "problem.toml"
+    path.write_text(DESIGNED, "utf-8")
+    A, B, Q, R = np.array([[1.2, 0.1], [0.0, 0.5]]), np.array([[1.0], [0.5]]), np.diag([1.0, 2.0]), np.array([[0.1]])
+    P = scipy.linalg.solve_discrete_are(A, B, Q, R)
+    np.testing.assert_allclose(pc.load(path).gain, np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A), rtol=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("R = [[0.1]]", "R = [[0.1, 1.0]]", "`gain.R` must have shape"),
+        (", R = [[0.1]]", "", "needs the key `R`"),
+        ("design_gain", "design", "Did you mean 'design_gain'?"),
+    ],
+)
+def test_gain_that_cannot_be_designed_is_refused_with_its_line(old, new, words, tmp_path):
+    path = tmp_path / "problem.toml"
+    path.write_text(DESIGNED.replace(old, new, 1), "utf-8")
+    with pytest.raises(pc.InputError) as caught:
+        pc.load(path)
+    assert "line 3" in str(caught.value) and words in str(caught.value)
 
 
 @pytest.mark.parametrize("build", [pytest.param(b, id=name) for name, each in PROBLEMS.items() for b in each])

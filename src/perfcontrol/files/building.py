@@ -18,6 +18,7 @@ from perfcontrol.files.registry import (
     IN_PYTHON_ONLY,
     ROWS,
     Argument,
+    DesignedGain,
     Row,
     parts_of,
     plain_type,
@@ -26,6 +27,7 @@ from perfcontrol.files.registry import (
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.solvers import AbstractSolver
 from perfcontrol.solvers.solve import check_feasible
+from perfcontrol.systems import design_gain
 
 LONGEST = 1_000_000  # horizon, where it is finite: what is longer is a slip, or has no use
 LARGEST = 10_000_000  # free parameters
@@ -174,6 +176,9 @@ def _built(row: Row, table: dict[str, Any], place: Place) -> Any:
         raise place.wrong(f"{owner} needs the key `{first.name}`, which is not given{more}. {_example(first)}")
     if row.gives is PerformativeProblem:
         _check_size(given, place)
+        if isinstance(weights := given.get("gain"), DesignedGain):
+            with _Located(place / "gain", {"Q", "R"}):
+                given["gain"] = design_gain(given["system"], Q=weights.Q, R=weights.R)
     with _Located(place, set(arguments)):
         return row.build(**given)
 

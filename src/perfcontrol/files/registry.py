@@ -100,6 +100,24 @@ def _row(build: Any, gives: Any = None, **settings: Any) -> Row:
     return Row(build, build if gives is None else gives, **settings)
 
 
+@dataclass(frozen=True)
+class DesignedGain:
+    """A gain of which a file gives the weights alone; the system of the same file does the rest."""
+
+    Q: Any
+    R: Any
+
+
+def design_gain(Q: Any, R: Any) -> DesignedGain:
+    """What a file says of `pc.design_gain`.
+
+    Args:
+        Q: (n, n) weight of the state, symmetric.
+        R: (m, m) weight of the input, symmetric positive definite.
+    """
+    return DesignedGain(Q, R)
+
+
 _SOLVER = {"kept": {"max_steps": "limit"}}
 
 ROWS = {
@@ -107,6 +125,7 @@ ROWS = {
     for row in (
         _row(systems.LinearSystem.diagonal, systems.LinearSystem, kept={"a": "A.values", "b": "B.values"}),
         _row(systems.LinearSystem, takes={"state_names": list[str], "input_names": list[str]}),
+        _row(design_gain, DesignedGain),
         # laws of noise and initial state
         _row(random_vectors.Constant),
         _row(random_vectors.Empirical),
@@ -187,7 +206,7 @@ ROWS = {
         # problems
         _row(
             PerformativeProblem,
-            takes={"noise": Law, "initial_state": Union[Any, Law]},  # noqa: UP007
+            takes={"noise": Law, "initial_state": Union[Any, Law], "gain": Union[Any, DesignedGain]},  # noqa: UP007
         ),
         _row(experiments.stock_market, PerformativeProblem),
         _row(experiments.market, PerformativeProblem),
