@@ -38,7 +38,9 @@ def from_control(sys: Any) -> LinearSystem:
 
         if sys.dt is None or sys.dt == 0:
             got = "a system in continuous time" if sys.dt == 0 else "a system without sampling time"
-            raise fail("sys", got, "be in discrete time", f"{DISCRETE} Or pass dt=True to control.ss: steps without a unit.")
+            raise fail(
+                "sys", got, "be in discrete time", f"{DISCRETE} Or pass dt=True to control.ss: steps without a unit."
+            )
         plant: Any = sys if kind.__name__ == "StateSpace" else control.ss(sys)
         return _system(plant.A, plant.B, plant.state_labels, plant.input_labels)
     required = "be a control.StateSpace, a control.TransferFunction or a scipy.signal.dlti"
