@@ -70,6 +70,7 @@ def test_value_gradient_and_hessian_of_the_sample_agree_with_central_differences
     np.testing.assert_allclose(hessian, by_differences, rtol=1e-6, atol=1e-7 * np.abs(hessian).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "feasible_set"),
     [

@@ -108,6 +108,7 @@ def test_continuation_finds_what_repeated_minimisation_cycles_about():
     assert_close(pc.solve(problem, SOLVER).M, pc.solve(problem, pc.StablePoint()).M, 1e-9)
 
 
+@pytest.mark.slow
 def test_continuation_does_not_claim_what_is_not_there():
     solution = pc.solve(performative_prediction(1.0), SOLVER, throw=False)
     assert solution.result == pc.Result.not_converged

@@ -98,6 +98,7 @@ def test_bound_contains_the_best_of_a_grid_on_three_hundred_problems():
     assert np.median(cells) <= 200
 
 
+@pytest.mark.slow
 def test_interval_narrows_as_it_is_asked_to_and_stays_nested():
     problem = reacting("squared norm", "unconstrained", 3)
     wide, narrow = pc.optimality_bound(problem, gap=0.1), pc.optimality_bound(problem, gap=1e-4)
