@@ -88,7 +88,7 @@ def sustained_form(world: World, memory: int) -> Array:
     )
     X, single = jax.lax.scan(advance, jnp.zeros((B.shape[1], size), B.dtype), early)
     (X, rest), _ = jax.lax.scan(add, (X, jnp.zeros_like(single[0])), late)
-    parts = jnp.concatenate([single[1:], (rest + world.D[-1] @ X)[None]])  # all that t >= H adds in one
-    coupled = jnp.flip(jnp.cumsum(jnp.flip(parts, axis=0), axis=0), axis=0).reshape(size, size)
+    parts = jnp.concatenate([single, (rest + world.D[-1] @ X)[None]])  # all that t >= H adds in one
+    coupled = tail_sums(parts, memory, memory + 1).reshape(size, size)
     held = tail_sums(world.S, memory, length)[jnp.maximum(*jnp.indices((memory, memory)))]
     return coupled + coupled.T + held.transpose(0, 2, 1, 3).reshape(size, size)

@@ -47,21 +47,20 @@ def _held(problem: PerformativeProblem) -> bool:
     return math.prod(problem.policy_shape) <= quadratics.DENSE_LIMIT
 
 
-def _separable(problem: PerformativeProblem, world: World) -> bool:
-    free = isinstance(problem.feasible_set, Unconstrained) and isinstance(problem.structure, FullStructure)
-    return free and stationary(world)
+def _free(problem: PerformativeProblem) -> bool:
+    return isinstance(problem.feasible_set, Unconstrained) and isinstance(problem.structure, FullStructure)
 
 
 def _on_host(problem: PerformativeProblem, deployed: Any, *others: Any) -> bool:
     """Whether the method works on the host, step by step: where the Hessian is held, or its factors are regular."""
     if not known(problem, deployed, *others):
         return False
-    return _held(problem) or _separable(problem, jax.eval_shape(world_of, problem, deployed))
+    return _held(problem) or (_free(problem) and stationary(jax.eval_shape(world_of, problem, deployed)))
 
 
 def _shape_of_cost(problem: PerformativeProblem, world: World) -> Any:
     """What the methods need to know of the quadratic; finite unless the world overflows."""
-    if _separable(problem, world):
+    if _free(problem) and stationary(world):
         return factors(problem, world)
     return quadratic(problem, world) if _held(problem) else quadratic_by_passes(problem, world)
 
