@@ -322,3 +322,17 @@ def test_response_pushforward_without_a_dense_hessian_matches_finite_differences
         lambda p, D, R, V: importlib.import_module("perfcontrol.response.respond").response_pushforward(p, D, R)(V)
     )(problem, DEPLOYED, response, direction)
     assert_close(pushed, (ahead - behind) / 2e-5, 1e-6)
+
+
+def test_best_response_to_noise_with_a_mean_has_no_gradient_at_several_lags():
+    """The sums over time behind the factors, lag by lag, against the gradient of one mean path."""
+    problem = pc.PerformativeProblem(
+        system=pc.LinearSystem([[0.8, 0.2], [0.0, 0.6]], [[1.0], [0.5]]),
+        horizon=7,
+        memory=3,
+        noise=pc.Gaussian([1.0, -0.5], np.diag([1.0, 0.3])),
+        cost=pc.QuadraticCost(np.eye(2), 0.1 * np.eye(1)),
+    )
+    M = pc.best_response(problem, jnp.zeros((3, 1, 2)))
+    start = jnp.linalg.norm(pc.expected_gradient(problem, jnp.zeros((3, 1, 2))))
+    assert float(jnp.linalg.norm(pc.expected_gradient(problem, M))) < 1e-11 * float(start)
