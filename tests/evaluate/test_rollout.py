@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import perfcontrol as pc
+from perfcontrol.evaluate import rollout
 from perfcontrol.evaluate.rollout import lanes
 from tests.evaluate.cases import BUILDERS, SmoothCost, case, replaced
 from tests.oracles.enumeration import Paths, simulate, stage_gradients
@@ -102,5 +103,18 @@ def test_fewer_paths_are_worked_on_together_where_perturbations_are_large():
         )
 
     assert lanes(dense(4, 10)) == 8
+    assert lanes(dense(4, 16_000)) == 4  # 1.5 MB of states, inputs and noise, 2 MB of matrices
     assert lanes(dense(100, 100)) == 2  # 8 MB a path
     assert lanes(dense(100, 400)) == 1
+
+
+def test_paths_that_do_not_fit_into_the_memory_are_refused_before_work_starts(monkeypatch):
+    c = case("zero means")
+    one = c.problem.horizon * 2 * 8  # bytes of one path's noise: less than those of the path
+    monkeypatch.setattr(rollout, "memory_size", lambda: 10 * one)
+    assert_refused(lambda: pc.simulate(c.problem, c.M, key=KEY, samples=40), "samples", "at most", "pc.estimate_cost")
+    assert pc.simulate(c.problem, c.M, key=KEY, samples=2).x.shape[0] == 2
+    monkeypatch.setattr(rollout, "memory_size", lambda: one)
+    assert_refused(lambda: pc.simulate(c.problem, c.M, key=KEY), "samples", "Shorten the horizon")
+    monkeypatch.setattr(rollout, "memory_size", lambda: None)
+    assert pc.simulate(c.problem, c.M, key=KEY, samples=40).x.shape[0] == 40

@@ -13,13 +13,14 @@ from jaxtyping import Array, Float, Key
 
 from perfcontrol._checks import check_integer, check_key, fail
 from perfcontrol._linalg import Diagonal, Matrix, along_time, matvec
+from perfcontrol._memory import memory_size
 from perfcontrol._programs import program
 from perfcontrol.perturbations import Draws, PathDraws
 from perfcontrol.policy import feedforward
 from perfcontrol.problem import PerformativeProblem, check_problem
 
 LANES = 8  # paths worked on together: twice as fast as all at once
-CACHE = 2**24  # bytes of perturbations beyond which working on more paths together slows them down
+CACHE = 2**24  # bytes of paths and perturbations beyond which working on more of them together slows them down
 
 
 class Path(eqx.Module):
@@ -124,8 +125,8 @@ def run_path(problem: PerformativeProblem, policy: Array, x0: Array, w: Array, d
     return Path(x, v - problem.feedback(x) if problem.has_gain else v, w, draws)
 
 
-def lanes(problem: PerformativeProblem, along: bool = False) -> int:
-    """How many paths a batched loop works on together: `LANES`, fewer where their perturbations leave the cache."""
+def bytes_held(problem: PerformativeProblem, along: bool = False) -> int:
+    """Bytes of one path: its states, inputs, noise and perturbations."""
     policy = jax.ShapeDtypeStruct(problem.lifted_shape, problem.dtype)
     key = jax.eval_shape(lambda: jax.random.key(0))
     draws = eqx.filter_eval_shape(
@@ -134,8 +135,28 @@ def lanes(problem: PerformativeProblem, along: bool = False) -> int:
         key,
         policy,
     )
-    size = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(draws))
-    return max(1, min(LANES, CACHE // max(size, 1)))
+    numbers = (problem.horizon + 1) * (2 * problem.state_size + problem.input_size)
+    return numbers * policy.dtype.itemsize + sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(draws))
+
+
+def lanes(problem: PerformativeProblem, along: bool = False) -> int:
+    """How many paths a batched loop works on together: `LANES`, fewer where what they hold leaves the cache."""
+    return max(1, min(LANES, CACHE // bytes_held(problem, along)))
+
+
+def _check_fits(problem: PerformativeProblem, samples: int) -> None:
+    """Raise, before any work, where the paths asked for are larger than the memory."""
+    n, m, memory = problem.state_size, problem.input_size, memory_size()
+    most = (problem.horizon + 1) * (2 * n + m + n * (n + m)) * problem.dtype.itemsize  # were all matrices held
+    if memory is None or samples * most <= memory or samples * (one := bytes_held(problem)) <= memory:
+        return
+    fewer = f"Ask for at most {memory // one} samples" if one <= memory else "Shorten the horizon"
+    raise fail(
+        "samples",
+        f"{samples} paths of {problem.horizon} steps: {samples * one / 2**30:.1f} GiB",
+        f"fit into the memory of {memory / 2**30:.1f} GiB",
+        f"{fewer}, or use pc.estimate_cost and pc.sample_gradient, which hold a few paths at a time.",
+    )
 
 
 @program(on_device=True)
@@ -202,11 +223,14 @@ def simulate(
         truncation: T of the paths, for an infinite horizon and only there.
 
     Raises:
-        InputError: wrong shapes, a missing key, samples < 1, an infinite horizon without truncation.
+        InputError: wrong shapes, a missing key, samples < 1, an infinite horizon without truncation, paths that do
+            not fit into the memory.
     """
     M, reacting = check_pair(problem, M, deployed)
     finite, weight = cut_off(problem, truncation)
-    paths = _simulate(finite, M, reacting, check_key(key), check_integer("samples", samples, 1))
+    key, samples = check_key(key), check_integer("samples", samples, 1)
+    _check_fits(finite, samples)
+    paths = _simulate(finite, M, reacting, key, samples)
     return eqx.tree_at(lambda p: p.cost, paths, weight * paths.cost)
 
 

@@ -169,6 +169,11 @@ class AbstractPerturbation(eqx.Module):
         return None
 
 
+def varying(matrices: Array | None) -> Array | None:
+    """`matrices` where they have a time axis: what stays the same is kept out of time loops, and held once."""
+    return matrices if matrices is not None and matrices.ndim == 3 else None
+
+
 def zero_mean(M: Array, horizon: int, columns: int) -> Array:
     """Θ_t = 0."""
     return jnp.zeros((horizon, M.shape[-1], columns), M.dtype)

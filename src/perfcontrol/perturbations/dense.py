@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Key
 
 from perfcontrol._checks import as_array, check_instance, fail
+from perfcontrol.perturbations import redrawn
 from perfcontrol.perturbations.base import (
     AbstractPerturbation,
     CovarianceOperator,
@@ -25,6 +26,30 @@ from perfcontrol.random_vectors import AbstractRandomVector
 
 WHITE_LAWS = (*sorted(SCALAR_LAWS), "gaussian", "sphere")
 BY_PRODUCTS = {"gaussian": normal_draws, "sphere": sphere_draws}  # what a path needs of them is cheap to draw
+
+
+class _White(eqx.Module):
+    """Z, (n, p): independent entries of a named law, one matrix on the sphere, or a random vector row by row."""
+
+    law: AbstractRandomVector | None
+    kind: str = eqx.field(static=True)
+    shape: tuple[int, int] = eqx.field(static=True)
+    dtype: Any = eqx.field(static=True)
+
+    def __call__(self, key: Key[Array, ""]) -> Array:
+        return self.many(key, 1)[0]
+
+    def many(self, key: Key[Array, ""], count: int) -> Array:
+        """`count` of them, independent."""
+        shape = (count, *self.shape)
+        if self.law is not None:
+            return self.law.sample(key, count).reshape(shape)
+        if self.kind not in BY_PRODUCTS:
+            return SCALAR_LAWS[self.kind].sample(key, shape, self.dtype)
+        Z = jax.random.normal(key, shape, self.dtype)
+        if self.kind == "sphere":
+            Z = Z * jnp.sqrt(math.prod(self.shape) / jnp.sum(Z**2, axis=(-2, -1), keepdims=True))
+        return Z
 
 
 class _WhiteCovariance(CovarianceOperator):
@@ -126,33 +151,32 @@ class DensePerturbation(AbstractPerturbation):
 
     def scales(self, M: Array, horizon: int) -> Array:
         """scale(M) entry by entry, (T, n, p)."""
+        return jnp.broadcast_to(self._values(M), (horizon, *self._shape(M)))
+
+    def _values(self, M: Array) -> Array:
+        """scale(M), with the axis T in front of two others where it varies."""
         values = as_array("scale", evaluate_map(self.scale, M, "scale"))
-        if values.ndim == 1:
-            values = values[:, None, None]
-        return jnp.broadcast_to(values, (horizon, *self._shape(M)))
+        return values[:, None, None] if values.ndim == 1 else values
 
     def _vector(self, M: Array) -> AbstractRandomVector:
         assert self.law is not None
         return self.law.resize(math.prod(self._shape(M)))
 
     def sample(self, key: Key[Array, ""], M: Array, horizon: int) -> Draws:
-        shape, scales = (horizon, *self._shape(M)), self.scales(M, horizon)
-        if self.law is not None:
-            Z = self._vector(M).sample(key, horizon).reshape(shape)
-        elif self.kind in BY_PRODUCTS:
-            Z = jax.random.normal(key, shape, scales.dtype)
-            if self.kind == "sphere":
-                Z = Z * jnp.sqrt(shape[1] * shape[2] / jnp.sum(Z**2, axis=(-2, -1), keepdims=True))
-        else:
-            Z = SCALAR_LAWS[self.kind].sample(key, shape, scales.dtype)
-        matrices = scales * Z
-        return DenseDraws(matrices if self.mean_map is None else matrices + self._location(M, horizon))
+        values = self._values(M)
+        white = _White(None if self.law is None else self._vector(M), self.kind, self._shape(M), values.dtype)
+        location = None if self.mean_map is None else evaluate_map(self.mean_map, M, "mean")
+        alike = self.law is None or self.law.covariance.ndim == 2  # at all times, as one drawn alone is taken to be
+        if alike and horizon * math.prod(white.shape) * values.dtype.itemsize > redrawn.HELD:
+            return redrawn.RedrawnDraws(key, jnp.arange(horizon), white, values, location)
+        matrices = values * white.many(key, horizon)
+        return DenseDraws(matrices if location is None else matrices + location)
 
     def sample_along(self, key: Key[Array, ""], M: Array, horizon: int) -> PathDraws:
         values = as_array("scale", evaluate_map(self.scale, M, "scale"))
         if self.kind not in BY_PRODUCTS or values.ndim > 1:
             return self.sample(key, M, horizon)
-        location = None if self.mean_map is None else self._location(M, horizon)
+        location = None if self.mean_map is None else evaluate_map(self.mean_map, M, "mean")
         return BY_PRODUCTS[self.kind](key, location, jnp.broadcast_to(values, (horizon,)), *self._shape(M))
 
     def _location(self, M: Array, horizon: int) -> Array:

@@ -9,28 +9,30 @@ from jaxtyping import Array, Key
 
 from perfcontrol._checks import as_array, fail
 from perfcontrol._linalg import Matrix, as_dense, matvec, rmatvec
-from perfcontrol.perturbations.base import AbstractPerturbation, CovarianceOperator, Draws, zero_mean
+from perfcontrol.perturbations.base import AbstractPerturbation, CovarianceOperator, Draws, varying, zero_mean
 from perfcontrol.perturbations.dependence import as_scale, check_values
 from perfcontrol.perturbations.scalar_laws import SCALAR_LAWS
 from perfcontrol.policy_maps import AbstractPolicyMap, as_policy_map, evaluate_map
 
 
 class _DirectionalDraws(Draws):
-    mean: Array | None  # (T, n, p)
+    mean: Array | None  # (n, p) or (T, n, p)
     coefficients: Array  # (T, k)
     directions: Array  # (k, n, p)
 
     @property
     def steps(self) -> Any:
-        return self.mean, self.coefficients
+        return varying(self.mean), self.coefficients
 
     def matvec_step(self, step: Any, z: Array) -> Array:
         mean, coefficients = step
+        mean = self.mean if mean is None else mean
         product = coefficients @ matvec(self.directions, z)
         return product if mean is None else product + matvec(mean, z)
 
     def rmatvec_step(self, step: Any, y: Array) -> Array:
         mean, coefficients = step
+        mean = self.mean if mean is None else mean
         product = coefficients @ rmatvec(self.directions, y)
         return product if mean is None else product + rmatvec(mean, y)
 
@@ -130,7 +132,7 @@ class DirectionalPerturbation(AbstractPerturbation):
     def sample(self, key: Key[Array, ""], M: Array, horizon: int) -> Draws:
         scales = self.scales(M, horizon)
         signs = SCALAR_LAWS[self.law].sample(key, scales.shape, scales.dtype)
-        mean = None if self.mean_map is None else self.mean(M, horizon)
+        mean = None if self.mean_map is None else evaluate_map(self.mean_map, M, "mean")
         return _DirectionalDraws(mean, scales * signs, self.directions)
 
     def mean(self, M: Array, horizon: int) -> Array:

@@ -17,17 +17,17 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from perfcontrol._linalg import matvec, rmatvec
-from perfcontrol.perturbations.base import PathDraws
+from perfcontrol.perturbations.base import PathDraws, varying
 
 
 class WhiteDraws(PathDraws):
     """Θ_t + s_t Z_t by its two products on one path.
 
-    location: Θ, None for zero; ahead: g, scaled to the sphere where Z lives on one; back: h; rest: ρ and χ² for the
-    sphere, None for normal entries.
+    location: Θ, None for zero, with the axis T where it varies; ahead: g, scaled to the sphere where Z lives on one;
+    back: h; rest: ρ and χ² for the sphere, None for normal entries.
     """
 
-    location: Float[Array, "T n p"] | None
+    location: Float[Array, "*T n p"] | None
     scale: Float[Array, " T"]
     ahead: Float[Array, "T n"]
     back: Float[Array, "T p"]
@@ -36,15 +36,17 @@ class WhiteDraws(PathDraws):
 
     @property
     def steps(self) -> Any:
-        return self.location, self.scale, self.ahead, self.back, self.rest
+        return varying(self.location), self.scale, self.ahead, self.back, self.rest
 
     def matvec_step(self, step: Any, z: Array) -> Array:
         location, scale, ahead, _, _ = step
+        location = self.location if location is None else location
         product = scale * jnp.linalg.norm(z) * ahead
         return product if location is None else product + matvec(location, z)
 
     def rmatvec_along(self, step: Any, y: Array, z: Array | None) -> Array:
         location, scale, ahead, back, rest = step
+        location = self.location if location is None else location
         assert z is not None
         size = jnp.linalg.norm(z)
         first = jnp.zeros_like(z).at[0].set(1)  # any direction will do where z vanishes
