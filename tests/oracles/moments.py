@@ -31,6 +31,7 @@ def expected_cost_moments(
     cross=None,
     state_target=None,
     input_target=None,
+    number: type = float,
 ) -> float:
     """The expected total cost, terminal stage included, from the first two moments of what is random.
 
@@ -43,32 +44,33 @@ def expected_cost_moments(
         initial_mean: (n,). initial_covariance: (n, n), about the mean.
         cross: N (T + 1, n, m), or None for zero.
         state_target: (T + 1, n), or None for zero. input_target: (T + 1, m), or None for zero.
+        number: object where the entries are numbers of Python, such as fractions, which do not round.
     """
-    A, B, K, Q, R, M, Theta = (np.asarray(value, dtype=float) for value in (A, B, K, Q, R, M, perturbation_mean))
+    A, B, K, Q, R, M, Theta = (np.asarray(value, dtype=number) for value in (A, B, K, Q, R, M, perturbation_mean))
     horizon, n, m = B.shape
     memory = M.shape[0]
-    N = np.zeros((horizon + 1, n, m)) if cross is None else np.asarray(cross, dtype=float)
-    xs = np.zeros((horizon + 1, n)) if state_target is None else np.asarray(state_target, dtype=float)
-    us = np.zeros((horizon + 1, m)) if input_target is None else np.asarray(input_target, dtype=float)
+    N = np.zeros((horizon + 1, n, m), dtype=number) if cross is None else np.asarray(cross, dtype=number)
+    xs = np.zeros((horizon + 1, n), dtype=number) if state_target is None else np.asarray(state_target, dtype=number)
+    us = np.zeros((horizon + 1, m), dtype=number) if input_target is None else np.asarray(input_target, dtype=number)
     size = n + memory * n + 1
 
     def lag(i: int) -> slice:
         """Where w_{t-i} lies in s_t."""
         return slice(n * i, n * (i + 1))
 
-    select_state = np.zeros((n, size))
-    select_state[:, :n] = np.eye(n)
-    constant = np.zeros(size)
-    constant[-1] = 1.0
-    inject = np.zeros((size, n))  # how w_t enters s_{t+1}: in the state and as the newest lag
-    inject[:n] = np.eye(n)
-    inject[lag(1)] = np.eye(n)
+    select_state = np.zeros((n, size), dtype=number)
+    select_state[:, :n] = np.eye(n, dtype=number)
+    constant = np.zeros(size, dtype=number)
+    constant[-1] = 1
+    inject = np.zeros((size, n), dtype=number)  # how w_t enters s_{t+1}: in the state and as the newest lag
+    inject[:n] = np.eye(n, dtype=number)
+    inject[lag(1)] = np.eye(n, dtype=number)
 
-    start = np.concatenate([np.asarray(initial_mean, dtype=float), np.zeros(memory * n), [1.0]])
+    start = np.concatenate([np.asarray(initial_mean, dtype=number), np.zeros(memory * n, dtype=number), [1]])
     S = np.outer(start, start)
     S[:n, :n] += initial_covariance
 
-    total = 0.0
+    total = 0
     for t in range(horizon + 1):
         select_input = -K[t] @ select_state
         for i in range(1, memory + 1):
@@ -84,11 +86,11 @@ def expected_cost_moments(
             select_perturbed = np.concatenate([select_state, select_input])
         else:
             select_perturbed = select_state
-        transition = np.zeros((size, size))
+        transition = np.zeros((size, size), dtype=number)
         transition[:n] = A[t] @ select_state + B[t] @ select_input + Theta[t] @ select_perturbed
         for i in range(1, memory):
-            transition[lag(i + 1), lag(i)] = np.eye(n)
-        transition[-1, -1] = 1.0
+            transition[lag(i + 1), lag(i)] = np.eye(n, dtype=number)
+        transition[-1, -1] = 1
         transition += np.outer(inject @ noise_mean[t], constant)
 
         spread = covariance_apply(t, select_perturbed @ S @ select_perturbed.T)
@@ -97,4 +99,4 @@ def expected_cost_moments(
             + inject @ noise_covariance[t] @ inject.T
             + select_state.T @ spread @ select_state
         )
-    return float(total)
+    return total if number is object else float(total)

@@ -23,6 +23,8 @@ from perfcontrol.evaluate.stationary import StationaryWorld, mean_square_radius,
 from perfcontrol.policy import feedforward, feedforward_adjoint
 from perfcontrol.problem import PerformativeProblem
 
+ROUNDINGS = 1000  # of the largest term of a cost: of fewer, not two digits are certain
+
 
 def cost_and_gradient(problem: PerformativeProblem, world: World, policy: Array) -> tuple[Array, Array]:
     """C_T and ∇_1 C_T at a lifted policy, given the world that the deployed policy makes; per stage in the limit."""
@@ -89,6 +91,25 @@ def check_answer(what: str, answer: Any, problem: PerformativeProblem, deployed:
     )
 
 
+def check_digits(cost: Any, problem: PerformativeProblem, world: World) -> None:
+    """Raise OverflowError where `cost` is no more than the rounding of what it would be without feedforward.
+
+    Where the deployed world grows, a policy works by cancelling: C = tr Σ(a + 2FᵀM̂ + M̂ᵀG M̂) is then a difference of
+    terms as large as the cost of M = 0, which carry its rounding.
+    """
+    if isinstance(world, StationaryWorld) or not known(cost, world):
+        return
+    if np.max(world.Lambda) <= 100 * np.max(world.Lambda[-1]):  # definite: the largest entry is on the diagonal
+        return
+    free, _ = weigh(problem, world, np.zeros(problem.policy_shape, cost.dtype))
+    if cost < ROUNDINGS * np.finfo(cost.dtype).eps * free:
+        raise OverflowError(
+            f"the expected cost is lost in the rounding of {cost.dtype.name}: without feedforward the same world costs "
+            f"{float(free):.3g}, and what this policy leaves of it has no certain digit. Use a stabilising gain, as of "
+            "pc.design_gain, or a shorter horizon."
+        )
+
+
 def expected_cost(problem: PerformativeProblem, M: Any, *, deployed: Any = None) -> Array:
     """Exact C_T(M; deployed) = E Σ_{t=0..T} c_t(x_t, u_t); `deployed=None` means M: the performative cost.
 
@@ -108,11 +129,15 @@ def expected_cost(problem: PerformativeProblem, M: Any, *, deployed: Any = None)
     Raises:
         InputError: wrong shapes, a cost or perturbation without closed moments; on an infinite horizon a deployed
             policy whose world is not mean-square stable.
-        OverflowError: the answer is too large for the precision of the problem.
+        OverflowError: the answer is too large for the precision of the problem, or lost in rounding where the policy
+            cancels a growth of many digits.
     """
     M, reacting = check_pair(problem, M, deployed)
     require_moments(problem)
-    return check_answer("the expected cost", exact_cost(problem, M, reacting), problem, reacting)
+    world = world_of(problem, reacting)
+    cost = check_answer("the expected cost", weigh(problem, world, M)[0], problem, reacting)
+    check_digits(cost, problem, world)
+    return cost
 
 
 def expected_gradient(problem: PerformativeProblem, M: Any, *, deployed: Any = None, total: bool = False) -> Array:

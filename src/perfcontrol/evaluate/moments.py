@@ -15,6 +15,8 @@ from jaxtyping import Array, Float
 from perfcontrol._checks import check_finite
 from perfcontrol._linalg import along_time, as_dense, symmetrise
 from perfcontrol._programs import program
+from perfcontrol.evaluate.cost_to_go import world_of
+from perfcontrol.evaluate.exact import check_digits
 from perfcontrol.evaluate.loop import known_covariance, require_moments
 from perfcontrol.evaluate.rollout import check_pair
 from perfcontrol.policy import lagged
@@ -152,4 +154,6 @@ def expected_cost_by_moments(problem: PerformativeProblem, M: Any, *, deployed: 
     M, reacting = check_pair(problem, M, deployed)
     require_moments(problem)
     check_end(problem)
-    return check_finite("the expected cost", _compiled_cost(problem, M, reacting))
+    cost = check_finite("the expected cost", _compiled_cost(problem, M, reacting))
+    check_digits(cost, problem, world_of(problem, reacting))
+    return cost

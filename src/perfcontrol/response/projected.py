@@ -167,7 +167,7 @@ def _newton_steps(feasible_set: AbstractSet, form: Quadratic, M: Array) -> tuple
 
 
 def _scale(form: Quadratic, M: Array) -> Array:
-    return frobenius(M) + form.step * frobenius(form.linear) + jnp.finfo(M.dtype).tiny
+    return frobenius(M) + frobenius(form.step * form.linear) + jnp.finfo(M.dtype).tiny
 
 
 def _accelerated(feasible_set: AbstractSet, form: Quadratic, start: Array, tolerance: Any, limit: int) -> Array:

@@ -136,16 +136,18 @@ def _hessian_matrix(problem: PerformativeProblem, world: World, linear: Array) -
 def _largest_eigenvalue(matrix: Array) -> Array:
     """An upper bound within rounding of ‖matrix‖ for a PSD matrix by power iteration on it, never zero."""
     tiny = jnp.finfo(matrix.dtype).tiny
+    unit = jnp.maximum(jnp.max(jnp.abs(matrix)), tiny)  # squares would overflow
+    matrix = matrix / unit
 
     def improve(_: Any, v: Array) -> Array:
         v = matrix @ v
         return v / jnp.maximum(jnp.linalg.norm(v), tiny)
 
     start = jnp.sqrt(jnp.sum(matrix**2, axis=0)) + tiny
-    v = jax.lax.fori_loop(0, 30, improve, start / jnp.linalg.norm(start))
+    v = jax.lax.fori_loop(0, 30, improve, start / jnp.maximum(jnp.linalg.norm(start), tiny))
     # 30 steps may stop below the norm: a tenth more keeps projected gradient steps stable.
     estimate = 1.1 * (v @ matrix @ v)
-    return jnp.maximum(jnp.minimum(estimate, jnp.trace(matrix)), tiny * matrix.shape[0])
+    return unit * jnp.maximum(jnp.minimum(estimate, jnp.trace(matrix)), jnp.finfo(matrix.dtype).eps)
 
 
 def _power_iteration(gradient: Operator, linear: Array) -> Array:
@@ -155,8 +157,10 @@ def _power_iteration(gradient: Operator, linear: Array) -> Array:
     def improve(_: Any, carry: tuple[Array, Array]) -> tuple[Array, Array]:
         v, _norm = carry
         image = gradient(v) - linear
+        unit = jnp.maximum(jnp.max(jnp.abs(image)), tiny)  # squares would overflow
+        image = image / unit
         norm = jnp.sqrt(jnp.sum(image**2))
-        return image / jnp.maximum(norm, tiny), norm
+        return image / jnp.maximum(norm, tiny), norm * unit
 
     start = jnp.ones_like(linear) / math.sqrt(linear.size)
     _, norm = jax.lax.fori_loop(0, 50, improve, (start, jnp.zeros((), linear.dtype)))

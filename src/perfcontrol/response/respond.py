@@ -205,7 +205,7 @@ def natural_residual(problem: PerformativeProblem, M: Any, deployed: Any, gradie
         return xp.asarray(xp.inf, at_M.dtype)
     step = _step(problem, world, form)
     moved = frobenius(M - nearest(problem.feasible_set, M - step * at_M))
-    scale = frobenius(M) + step * frobenius(form.linear)
+    scale = frobenius(M) + frobenius(step * form.linear)
     return xp.where(sound, moved / xp.where(scale > 0, scale, 1), xp.inf)
 
 

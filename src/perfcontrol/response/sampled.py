@@ -144,7 +144,7 @@ def minimise(world: Sampled, deployed: Any, start: Any) -> tuple[Any, Any]:
         """Where the model leads, and how far that is relative to the policies that it knows."""
         model = _model(world, at, M, damping)
         ahead, _ = model.minimise(M)
-        scale = frobenius(ahead) + model.form.step * frobenius(model.form.linear)
+        scale = frobenius(ahead) + frobenius(model.form.step * model.form.linear)
         return ahead, frobenius(ahead - M) / xp.where(scale > 0, scale, 1)
 
     def improve(carry: Any) -> Any:
@@ -219,7 +219,7 @@ def sampled_residual(world: Sampled, M: Any, deployed: Any) -> Any:
         return xp.asarray(xp.inf, M.dtype)
     form = _model(world, at, M).form
     moved = frobenius(M - nearest(world.feasible_set, M - form.step * at.gradient))
-    scale = frobenius(M) + form.step * frobenius(form.linear)
+    scale = frobenius(M) + frobenius(form.step * form.linear)
     return xp.where(_finite(at), moved / xp.where(scale > 0, scale, 1), xp.inf)
 
 
