@@ -15,8 +15,13 @@ from perfcontrol.cli.progress import stages
 @app.command()
 def certify(
     problem_name: Annotated[
-        str, typer.Argument(metavar="[stock|FILE]", help="The paper's stock market, a problem file, or a run.")
-    ] = "stock",
+        str | None,
+        typer.Argument(
+            metavar="[stock|FILE]",
+            help="The paper's stock market, a problem file, or a run.",
+            show_default="problem.toml where there is one, else stock",
+        ),
+    ] = None,
     order: Annotated[
         Literal["ascending", "descending", "random"],
         typer.Option(help="Of stock: sensitivities over time."),
@@ -48,6 +53,8 @@ def certify(
         if given not in KINDS:
             raise refuse(f"--kind: must be one of {', '.join(KINDS)}; got {given!r}.")
 
+    if problem_name is None:
+        problem_name = "problem.toml" if Path("problem.toml").exists() else "stock"
     if problem_name == "stock":
         problem, title = stock_market(order, growth=growth, feasible_set=feasible_set), f"stock, {order}, {growth:g}"
     else:
