@@ -10,7 +10,8 @@ from benchmarks import numpy_gradients
 from benchmarks.measure import Row, compiled, median_time, side_by_side
 from benchmarks.problems import policy_of
 from perfcontrol.evaluate.adjoint import mean_path_gradient, path_gradient
-from perfcontrol.evaluate.rollout import lanes, sample_path
+from perfcontrol.evaluate.paths import lanes
+from perfcontrol.evaluate.rollout import sample_path
 from perfcontrol.experiments.batches import in_single_precision
 
 SEEDS = 288

@@ -7,7 +7,7 @@ import pytest
 
 import perfcontrol as pc
 from perfcontrol.evaluate import rollout
-from perfcontrol.evaluate.rollout import lanes
+from perfcontrol.evaluate.paths import lanes
 from tests.evaluate.cases import BUILDERS, SmoothCost, case, replaced
 from tests.oracles.enumeration import Paths, simulate, stage_gradients
 from tests.tools import assert_close, assert_refused, relative_error

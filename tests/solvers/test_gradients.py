@@ -55,7 +55,7 @@ def test_two_point_estimate_is_the_path_gradient_along_its_direction():
     problem = drifting(0)
     policy, size = 0.1 * jnp.ones(problem.policy_shape), 12
     estimate = np.ravel(pc.TwoPoint(2.0)(problem, policy, policy, KEY, 1))
-    path_key, _ = jax.random.split(KEY)
+    path_key, _ = jax.random.split(jax.random.fold_in(KEY, 0))
     gradient = np.ravel(mean_path_gradient(problem, policy, policy, path_key, 1))
     # estimate = p (g·U) U, so that |estimate|² = p g·estimate, whatever U is
     assert_close(estimate @ estimate, size * gradient @ estimate, 1e-9)

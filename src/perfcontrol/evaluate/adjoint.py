@@ -6,7 +6,6 @@ The same numbers as the paper's double sum (Appendix B, "grad M ct"), which cost
 Algorithm 1 leaves out of its own objective, is included.
 """
 
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -16,6 +15,7 @@ from jaxtyping import Array, Float, Key
 from perfcontrol._checks import as_array, check_integer, check_key, check_shape, fail
 from perfcontrol._linalg import rmatvec
 from perfcontrol._programs import program
+from perfcontrol.evaluate.paths import devices_for, over_paths
 from perfcontrol.evaluate.rollout import (
     Path,
     Trajectories,
@@ -23,7 +23,6 @@ from perfcontrol.evaluate.rollout import (
     cut_off,
     input_adjoint,
     input_term,
-    lanes,
     sample_along,
 )
 from perfcontrol.policy import feedforward_adjoint
@@ -112,21 +111,8 @@ def recover_noise(
     return x[1:] - jnp.einsum("tij,tj->ti", A, x[:-1]) - input_term(problem.system.B, u)
 
 
-def over_paths(
-    problem: PerformativeProblem, one: Callable[[Array], Any], key: Key[Array, ""], samples: int, along: bool = False
-) -> Any:
-    """What `one` makes of each of `samples` keys, with a leading axis; pure, for use inside compiled loops."""
-    if samples == 1:
-        return jax.tree.map(lambda leaf: leaf[None], one(key))
-    return jax.lax.map(
-        lambda index: one(jax.random.fold_in(key, index)),
-        jnp.arange(samples),
-        batch_size=min(lanes(problem, along), samples),
-    )
-
-
 def mean_path_gradient(
-    problem: PerformativeProblem, M: Array, deployed: Array, key: Key[Array, ""], samples: int
+    problem: PerformativeProblem, M: Array, deployed: Array, key: Key[Array, ""], samples: int, devices: int = 1
 ) -> Array:
     """Mean over `samples` paths of ∇_1 along each path; pure, for use inside compiled loops."""
     policy, reacting = problem.structure.lift(M), problem.structure.lift(deployed)
@@ -134,7 +120,9 @@ def mean_path_gradient(
     def one(path_key: Array) -> Array:
         return path_gradient(problem, sample_along(problem, policy, reacting, path_key))
 
-    return jnp.mean(over_paths(problem, one, key, samples, along=True), axis=0)
+    if samples == 1:
+        return one(key)
+    return jnp.mean(over_paths(problem, one, key, samples, along=True, devices=devices), axis=0)
 
 
 _compiled_mean_path_gradient = program(mean_path_gradient, on_device=True)
@@ -169,5 +157,6 @@ def sample_gradient(
     """
     M, reacting = check_pair(problem, M, deployed)
     finite, weight = cut_off(problem, truncation)
-    samples = check_integer("samples", samples, 1)
-    return weight * _compiled_mean_path_gradient(finite, M, reacting, check_key(key), samples)
+    key, samples = check_key(key), check_integer("samples", samples, 1)
+    devices = devices_for(samples, finite, M, reacting, key)
+    return weight * _compiled_mean_path_gradient(finite, M, reacting, key, samples, devices)

@@ -15,6 +15,7 @@ from perfcontrol._checks import check_integer, check_key, fail
 from perfcontrol._linalg import Diagonal, Matrix, along_time, matvec
 from perfcontrol._memory import memory_size
 from perfcontrol._programs import program
+from perfcontrol.evaluate.paths import bytes_held, devices_for, over_paths
 from perfcontrol.perturbations import Draws, PathDraws
 from perfcontrol.policy import feedforward
 from perfcontrol.problem import PerformativeProblem, check_problem
@@ -125,25 +126,6 @@ def run_path(problem: PerformativeProblem, policy: Array, x0: Array, w: Array, d
     return Path(x, v - problem.feedback(x) if problem.has_gain else v, w, draws)
 
 
-def bytes_held(problem: PerformativeProblem, along: bool = False) -> int:
-    """Bytes of one path: its states, inputs, noise and perturbations."""
-    policy = jax.ShapeDtypeStruct(problem.lifted_shape, problem.dtype)
-    key = jax.eval_shape(lambda: jax.random.key(0))
-    draws = eqx.filter_eval_shape(
-        lambda p, key, M: (p.sample_along if along else p.sample)(key, M, problem.horizon).steps,
-        problem.perturbation,
-        key,
-        policy,
-    )
-    numbers = (problem.horizon + 1) * (2 * problem.state_size + problem.input_size)
-    return numbers * policy.dtype.itemsize + sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(draws))
-
-
-def lanes(problem: PerformativeProblem, along: bool = False) -> int:
-    """How many paths a batched loop works on together: `LANES`, fewer where what they hold leaves the cache."""
-    return max(1, min(LANES, CACHE // bytes_held(problem, along)))
-
-
 def _check_fits(problem: PerformativeProblem, samples: int) -> None:
     """Raise, before any work, where the paths asked for are larger than the memory."""
     n, m, memory = problem.state_size, problem.input_size, memory_size()
@@ -160,25 +142,29 @@ def _check_fits(problem: PerformativeProblem, samples: int) -> None:
 
 
 @program(on_device=True)
-def _simulate(problem: PerformativeProblem, M: Array, deployed: Array, key: Array, samples: int) -> Trajectories:
+def _simulate(
+    problem: PerformativeProblem, M: Array, deployed: Array, key: Array, samples: int, devices: int
+) -> Trajectories:
     policy, reacting = problem.structure.lift(M), problem.structure.lift(deployed)
 
-    def one(index: Array) -> tuple[Array, Array, Array, Array, Draws]:
-        path = sample_path(problem, policy, reacting, jax.random.fold_in(key, index))
+    def one(key: Array) -> tuple[Array, Array, Array, Array, Draws]:
+        path = sample_path(problem, policy, reacting, key)
         return path.x, path.u, path.w, jnp.sum(problem.cost.path_cost(path.x, path.u)), path.draws
 
-    return Trajectories(*jax.lax.map(one, jnp.arange(samples), batch_size=min(lanes(problem), samples)))
+    return Trajectories(*over_paths(problem, one, key, samples, devices=devices))
 
 
 @program(on_device=True)
-def _path_costs(problem: PerformativeProblem, M: Array, deployed: Array, key: Array, samples: int) -> Array:
+def _path_costs(
+    problem: PerformativeProblem, M: Array, deployed: Array, key: Array, samples: int, devices: int
+) -> Array:
     policy, reacting = problem.structure.lift(M), problem.structure.lift(deployed)
 
-    def one(index: Array) -> Array:
-        path = sample_along(problem, policy, reacting, jax.random.fold_in(key, index))
+    def one(key: Array) -> Array:
+        path = sample_along(problem, policy, reacting, key)
         return jnp.sum(problem.cost.path_cost(path.x, path.u))
 
-    return jax.lax.map(one, jnp.arange(samples), batch_size=min(lanes(problem, along=True), samples))
+    return over_paths(problem, one, key, samples, along=True, devices=devices)
 
 
 def check_pair(problem: PerformativeProblem, M: Any, deployed: Any) -> tuple[Array, Array]:
@@ -230,7 +216,10 @@ def simulate(
     finite, weight = cut_off(problem, truncation)
     key, samples = check_key(key), check_integer("samples", samples, 1)
     _check_fits(finite, samples)
-    paths = _simulate(finite, M, reacting, key, samples)
+    devices = devices_for(samples, finite, M, reacting, key)
+    paths = _simulate(finite, M, reacting, key, samples, devices)
+    if devices > 1:  # what is done with paths next is no affair of all devices
+        paths = jax.device_put(paths, jax.local_devices()[0])
     return eqx.tree_at(lambda p: p.cost, paths, weight * paths.cost)
 
 
@@ -261,5 +250,6 @@ def estimate_cost(
     """
     M, reacting = check_pair(problem, M, deployed)
     finite, weight = cut_off(problem, truncation)
-    costs = weight * _path_costs(finite, M, reacting, check_key(key), check_integer("samples", samples, 2))
+    key, samples = check_key(key), check_integer("samples", samples, 2)
+    costs = weight * _path_costs(finite, M, reacting, key, samples, devices_for(samples, finite, M, reacting, key))
     return Estimate(jnp.mean(costs), jnp.std(costs, ddof=1) / jnp.sqrt(samples))

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from perfcontrol._array_files import filled
-from perfcontrol.evaluate.rollout import LANES, lanes
+from perfcontrol.evaluate.paths import LANES, lanes
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.solvers.base import AbstractSolver
 from perfcontrol.solvers.result import Result

@@ -8,7 +8,8 @@ from jaxtyping import Array, Key
 
 from perfcontrol._checks import as_array, fail, is_concrete
 from perfcontrol._linalg import along_time, as_dense
-from perfcontrol.evaluate.adjoint import over_paths, path_gradient
+from perfcontrol.evaluate.adjoint import path_gradient
+from perfcontrol.evaluate.paths import over_paths
 from perfcontrol.evaluate.rollout import Path, input_term, sample_path
 from perfcontrol.perturbations.base import DenseDraws
 from perfcontrol.problem import PerformativeProblem

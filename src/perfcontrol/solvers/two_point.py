@@ -8,7 +8,7 @@ from jaxtyping import Array, Key
 
 from perfcontrol._checks import as_array, fail, is_concrete
 from perfcontrol._linalg import frobenius
-from perfcontrol.evaluate.adjoint import over_paths
+from perfcontrol.evaluate.paths import over_paths
 from perfcontrol.evaluate.rollout import run_path, sample_path
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.solvers.gradients import AbstractGradient

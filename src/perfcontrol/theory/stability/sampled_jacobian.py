@@ -15,7 +15,7 @@ from jaxtyping import Array, Key
 
 from perfcontrol._programs import program
 from perfcontrol.evaluate.adjoint import mean_path_gradient
-from perfcontrol.evaluate.rollout import lanes
+from perfcontrol.evaluate.paths import lanes
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.theory.precision import in_double
 
