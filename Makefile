@@ -58,7 +58,7 @@ reproduce: $(APP_READY) ## Run the paper's experiment into results/paper (option
 test: lint types imports docs doctest pytest pytest32 ## Run every check except the slow tests
 
 .PHONY: check
-check: test slow dist-check ## Run every check, the slow tests and the built package included
+check: lint types imports docs doctest coverage pytest32 slow dist-check oldest newest mutation ## Run every check (hours)
 
 .PHONY: lint
 lint: $(DEV_READY) ## Check style and formatting
@@ -103,6 +103,25 @@ pytest32: $(DEV_READY) ## Run the tests marked float32 in single precision
 slow: $(DEV_READY) ## Run the tests marked slow
 	PERFCONTROL_TEST_OPTIMISED=1 $(FLOAT64) $(PYTEST) $(CHECKED) -m slow $(PYTEST_ARGS)
 
+.PHONY: coverage
+coverage: $(DEV_READY) ## Run the tests in double precision; fail where they reach less than 95 % of the lines
+	$(FLOAT64) $(PYTEST) $(CHECKED) --cov --cov-report= $(PYTEST_ARGS)
+	$(BIN)/coverage report --sort=cover
+	@$(BIN)/coverage json -q -o - | $(BIN)/python -c 'import json, sys; t = json.load(sys.stdin)["totals"]; \
+	  lines, branches = t["percent_statements_covered"], t["percent_branches_covered"]; \
+	  print(f"lines {lines:.2f} %, branches {branches:.2f} %"); sys.exit(lines < 95)'
+
+.PHONY: mutation
+mutation: $(DEV_READY) ## Make small faults, one at a time; fail where the tests notice less than 90 % (options: ARGS="...")
+	$(CACHE) $(BIN)/python -m benchmarks.mutation --workers $(WORKERS) --least 90 $(ARGS) evaluate solvers perturbations sets
+
+.PHONY: oldest newest
+oldest: ## Run the tests with the oldest versions that pyproject.toml allows
+	.ci/with-versions "$(PYTHON)" oldest -n $(WORKERS) --dist loadfile $(PYTEST_ARGS)
+
+newest: ## Run the tests with the newest versions there are
+	.ci/with-versions "$(PYTHON)" newest -n $(WORKERS) --dist loadfile $(PYTEST_ARGS)
+
 .PHONY: docs
 docs: $(DEV_READY) ## Build the documentation into site/, warnings being errors
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
@@ -124,7 +143,7 @@ bench: $(DEV_READY) ## Run the benchmarks (options: ARGS="...")
 
 .PHONY: clean
 clean: ## Remove caches and built files; keep .venv and results/
-	rm -rf build dist site .jax_cache .pytest_cache .ruff_cache .hypothesis .import_linter_cache
+	rm -rf build dist site .coverage .jax_cache .pytest_cache .ruff_cache .hypothesis .import_linter_cache
 	find src tests benchmarks docs examples -name __pycache__ -type d -prune -exec rm -rf {} + 2>/dev/null || true
 
 .PHONY: distclean

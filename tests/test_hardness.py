@@ -1,5 +1,6 @@
 """Numbers that are hard on arithmetic: a right answer, or a refusal with a name; never a wrong or an empty number."""
 
+import importlib
 from fractions import Fraction
 
 import jax
@@ -118,6 +119,17 @@ def test_units_of_noise_and_cost_do_not_change_the_stable_policy(feasible_set):
         scaled = pc.solve(problem, pc.StablePoint())
         assert_close(scaled.M, usual.M, 1e-9)
         assert_close(pc.expected_cost(problem, scaled.M), units[0] ** 2 * units[1] * cost, 1e-9)
+
+
+def test_units_do_not_change_a_best_response_by_products_alone(monkeypatch):
+    def response(**units):
+        problem = plant(feasible_set=pc.RowSum(0.1), **units)
+        return pc.best_response(problem, problem.initial_policy())
+
+    usual = response()
+    monkeypatch.setattr(importlib.import_module("perfcontrol.response.quadratic"), "DENSE_LIMIT", 1)
+    for units in ({"cost": 1e100}, {"cost": 1e-100}, {"noise": 1e100}, {"noise": 1e-100}):
+        assert_close(response(**units), usual, 1e-9)
 
 
 def test_weights_and_covariances_below_normal_numbers_are_refused():

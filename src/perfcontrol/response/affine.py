@@ -76,7 +76,9 @@ class AffineByProducts:
         self.project = feasible_set.project
 
     def _tangent(self, V: Array) -> Array:
-        return self.project(V) - self.origin
+        largest = jax.lax.stop_gradient(jnp.max(jnp.abs(V)))
+        unit = jnp.where(largest > 0, largest, 1)  # what is tiny would be lost beside the origin
+        return unit * (self.project(V / unit) - self.origin)
 
     def solve(self, gradient: Array) -> Array:
         """The Newton step for a gradient, or for each of several along the first axis."""
@@ -84,13 +86,13 @@ class AffineByProducts:
         if gradient.ndim > form.linear.ndim:
             return jax.lax.map(self.solve, gradient)
 
-        def hessian(V: Array) -> Array:
-            return self._tangent(form.gradient(self._tangent(V)) - form.linear)
+        def hessian(V: Array) -> Array:  # in units of its largest eigenvalue: squares would overflow
+            return form.step * self._tangent(form.gradient(self._tangent(V)) - form.linear)
 
         tolerance = 20 * float(jnp.finfo(form.linear.dtype).eps)
-        right = -self._tangent(self._tangent(gradient))
+        right = -form.step * self._tangent(self._tangent(gradient))
         # What rounding leaves of a gradient need not be in the range of the Hessian: never chase it.
-        rounding: Any = tolerance * (frobenius(gradient) + frobenius(form.linear))
+        rounding: Any = tolerance * (frobenius(form.step * gradient) + frobenius(form.step * form.linear))
         found = jax.scipy.sparse.linalg.cg(hessian, right, tol=tolerance, atol=rounding, maxiter=10 * right.size)[0]
         return self._tangent(found)
 
