@@ -222,3 +222,10 @@ LAWS_REFUSED = {
 @pytest.mark.parametrize("case", LAWS_REFUSED.values(), ids=LAWS_REFUSED.keys())
 def test_law_is_refused_with_a_four_part_error(case):
     assert_refused(*case)
+
+
+def test_stochastic_volatility_is_that_of_the_normals_of_its_key():
+    key, epsilon = jax.random.key(0), np.array([0.05, 0.5, 0.6])
+    v = np.minimum(np.exp(np.log(epsilon)[:, None] + 0.2 * np.asarray(jax.random.normal(key, (3, 2)))), 0.6)
+    expected = np.exp((0.1 - v**2 / 2) / 3 + v / np.sqrt(3))
+    assert_close(pc.StochasticVolatility(epsilon, 0.1, stocks=2).sample(key, 3), expected, 1e-14)

@@ -12,16 +12,17 @@ import xarray
 import perfcontrol as pc
 from perfcontrol import results
 from perfcontrol.config import REGIMES, ReproduceSettings
-from perfcontrol.experiments.batches import costs, in_single_precision
+from perfcontrol.experiments.batches import in_single_precision
 from perfcontrol.experiments.reproduce import Outcome, reproduce
 from perfcontrol.experiments.reproduce import divergence as divergence_stage
+from perfcontrol.experiments.reproduce.by_stock import CEILING, costs
 from perfcontrol.experiments.reproduce.cases import CASES, UNSTABLE, problems_of, silent, starts_of
 from perfcontrol.experiments.reproduce.exact import exact_stage
 from perfcontrol.experiments.reproduce.laboratory import constant_step, laboratory, names_of
 from perfcontrol.experiments.reproduce.stages import Stages
 from perfcontrol.plotting import paper_figures
 from perfcontrol.reports.paper import judge, regimes, theorems
-from perfcontrol.solvers.rows import pick
+from tests.tools import normal
 
 SETTINGS = ReproduceSettings(seeds=3, steps=100, cure_steps=200, sweep_seeds=2, sweep_steps=100)
 STAGES = ("exact", "exact_simplex", "optimum", "runs", "cure", "sweep")
@@ -67,7 +68,7 @@ def test_runs_equal_single_solves_with_the_same_key(done: tuple[Path, Outcome]) 
     assert float(picked["cost"][-1]) == pytest.approx(cost, rel=1e-4)
 
 
-def test_stopped_runs_repeat_the_last_policy_and_its_cost() -> None:
+def test_stopped_runs_repeat_the_last_policy() -> None:
     problems = problems_of(SETTINGS, "rows")
     lab = laboratory(SETTINGS, problems, xarray.Dataset())
     case, steps = np.array([UNSTABLE]), 300
@@ -76,10 +77,22 @@ def test_stopped_runs_repeat_the_last_policy_and_its_cost() -> None:
     assert solution.steps.max() < 100, "stopped within the first compiled call"
     policies = np.asarray(solution.history)
     assert np.all(policies[:, :, 100:] == policies[:, :, 99:100])
-    cost = costs(pick(lab.problems, case), policies, np.asarray(solution.steps))
-    assert np.all(cost[:, :, 100:] == cost[:, :, 99:100])
-    first = float(pc.expected_cost(problems[UNSTABLE], lab.starts[0]))
-    assert float(cost[0, 0, 0]) == pytest.approx(first, rel=1e-4)
+
+
+@pytest.mark.parametrize("feasible_set", ["rows", "simplex"])
+def test_costs_stock_by_stock_are_the_exact_costs_of_the_general_engine(feasible_set: str) -> None:
+    """Rows of any sums, a market of its own in every number."""
+    problem = pc.experiments.stock_market("random", 0.97, 120.0, 0.2, 8.0, feasible_set=feasible_set)
+    policies = 0.05 + 0.01 * np.asarray(normal(0, 1, 5, *problem.policy_shape))
+    expected = [pc.expected_cost(problem, M) for M in policies[0]]
+    np.testing.assert_allclose(costs(problem, policies), [expected], rtol=1e-12)
+
+
+def test_costs_of_runaway_policies_are_the_ceiling() -> None:
+    problem = pc.experiments.stock_market("random")
+    policies = np.stack([np.full((1, 10, 10), size) for size in (0.03, 1e8, np.inf)])
+    cost = costs(problem, policies.astype(np.float32))
+    assert cost[0] < CEILING and np.all(cost[1:] == CEILING)
 
 
 def test_smaller_step_ends_on_the_floor_that_the_theory_gives(done: tuple[Path, Outcome]) -> None:

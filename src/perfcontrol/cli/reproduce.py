@@ -1,5 +1,6 @@
 """`perfcontrol reproduce`."""
 
+import os
 import time
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -63,6 +64,8 @@ def reproduce(
             name = str(problem["loc"][0]).replace("_", "-")
             failures.append(refuse(f"--{name}: {problem['msg']}; got {problem['input']!r}."))
         raise failures[0] from None
+    # Before NumPy is there: on matrices of order 100, threads of the linear algebra wait for one another.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     configure_jax()
     from perfcontrol.experiments.reproduce import reproduce as run
 

@@ -10,7 +10,8 @@ import xarray
 from jaxtyping import Array
 
 from perfcontrol.config import REGIMES, ReproduceSettings
-from perfcontrol.experiments.batches import CEILING, StepRule, costs, in_single_precision
+from perfcontrol.experiments.batches import StepRule, in_single_precision
+from perfcontrol.experiments.reproduce.by_stock import CEILING, costs
 from perfcontrol.experiments.reproduce.cases import CASES, Progress, starts_of
 from perfcontrol.experiments.stock import HORIZON, ORDERS
 from perfcontrol.problem import PerformativeProblem
@@ -87,7 +88,9 @@ def names_of(solution: Solution) -> np.ndarray:
     return names
 
 
-def run_stage(lab: Laboratory, settings: ReproduceSettings, progress: Progress) -> xarray.Dataset:
+def run_stage(
+    lab: Laboratory, problems: list[PerformativeProblem], settings: ReproduceSettings, progress: Progress
+) -> xarray.Dataset:
     """The paper's RSGD: error and exact cost of every iterate."""
     seeds, length = settings.seeds, settings.steps + 1
     shape = (len(REGIMES), len(ORDERS), seeds)
@@ -97,7 +100,8 @@ def run_stage(lab: Laboratory, settings: ReproduceSettings, progress: Progress) 
     rule = constant_step(settings.step_size)
     solution = lab.run(cases, 2, stream, rule, settings.steps, lambda share: progress("RSGD runs", share))
     taken = np.asarray(solution.steps)
-    error, cost = lab.errors(cases, solution), costs(lab.problems, np.asarray(solution.history), taken)
+    error, history = lab.errors(cases, solution), np.asarray(solution.history)
+    cost = np.stack([costs(problem, policies) for problem, policies in zip(problems, history, strict=True)])
     dims = ("regime", "order", "seed")
     per_step = ((*dims, "step"), (*shape, length))
     data = {

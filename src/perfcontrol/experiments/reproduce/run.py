@@ -68,7 +68,7 @@ def reproduce(out: Path, settings: ReproduceSettings, progress: Progress | None 
         exact_bounded = waiting[0].result() if waiting else None
     lab = laboratory(settings, problems, exact)
     bounded = None if exact_bounded is None else laboratory(settings, bounded_problems, exact_bounded)
-    runs = stages.run("runs", lambda: run_stage(lab, settings, progress))
+    runs = stages.run("runs", lambda: run_stage(lab, problems, settings, progress))
     cure = stages.run("cure", lambda: cure_stage(lab, bounded, settings, progress))
     sweep = stages.run("sweep", lambda: sweep_stage(lab, settings, progress))
     began = time.monotonic()
