@@ -65,7 +65,7 @@ def optimal_policy(problem: PerformativeProblem, gap: float = GAP) -> tuple[floa
     grid = np.linspace(low, high, GRID)
     around = int(np.argmin(cost(grid)))
     ends = grid[max(around - 1, 0)], grid[min(around + 1, GRID - 1)]
-    found = minimize_scalar(cost, bounds=ends, method="bounded", options={"xatol": 1e-10})
+    found: Any = minimize_scalar(cost, bounds=ends, method="bounded", options={"xatol": 1e-10})
     tried = np.array([0.0, *ends, found.x])
     best = float(tried[np.argmin(cost(tried))])
     least = float(cost(best))
