@@ -3,6 +3,7 @@
 import json
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -10,7 +11,9 @@ from typer.testing import CliRunner
 import perfcontrol as pc
 from perfcontrol.cli import app, plans
 from perfcontrol.cli.new import TEMPLATES
+from perfcontrol.cli.solve import _boundary
 from perfcontrol.results import load_dataset
+from tests.solvers.problems import performative_prediction
 
 SMALL = """\
 horizon = 3
@@ -67,6 +70,14 @@ def test_solve_does_what_the_same_program_does_and_keeps_it(file, tmp_path):
     assert "which holds" in run("solve", file, "--out", tmp_path / "run", status=2).stderr
     assert "has ended" in run("resume", tmp_path / "run").stdout
     assert "perfcontrol new nowhere.toml" in run("solve", "nowhere.toml", status=2).stderr.replace("\n", " ")
+
+
+def test_solve_says_where_the_feasible_set_holds_the_policy_back():
+    ball = performative_prediction(0.5, feasible_set=pc.FrobeniusBall(2.0))
+    rows = performative_prediction(0.5, feasible_set=pc.RowSum(2.0))
+    (line,) = _boundary(ball, jnp.full(ball.policy_shape, -2.0))
+    assert "boundary" in line
+    assert _boundary(ball, jnp.full(ball.policy_shape, 1.9)) == _boundary(rows, jnp.full(rows.policy_shape, 2.0)) == []
 
 
 def test_solve_says_what_is_certified_and_ends_with_one_where_the_method_fails(file, tmp_path):

@@ -20,6 +20,7 @@ KINDS = ("paper", "rigorous", "global", "sharp")
 STATUSES = ("proved", "declared", "estimated")  # from the strongest on
 CHECKPOINT = "checkpoint"
 ROWS, COLUMNS = 12, 8  # of a policy that is printed
+NUDGE = 1e-6  # relative to the policy: how near the boundary of a set counts as on it
 
 
 @app.command()
@@ -99,7 +100,7 @@ def _plain(array: Any) -> Any:
 
 def _show(run: "Run", cost: dict[str, Any], out: Path | None) -> None:
     lines = [str(run.solution), f"  cost in the world that it makes: {said(cost)}; {run.seconds:.1f} s"]
-    lines += _policy(run.problem, run.solution.M)
+    lines += _policy(run.problem, run.solution.M) + _boundary(run.problem, run.solution.M)
     lines += verdicts(run.certificates)
     if out is not None:
         lines.append(f"kept in {out}: perfcontrol simulate {out}, or pc.load({str(out)!r})")
@@ -125,6 +126,14 @@ def _policy(problem: Any, M: Any) -> list[str]:
         for name, row in zip(inputs, rows, strict=True):
             lines.append(f"  {f'lag {lag}, {name}':<{front}}" + "".join(f"{value:>{width}.4g}" for value in row))
     return lines
+
+
+def _boundary(problem: Any, M: Any) -> list[str]:
+    """Whether the feasible set holds the policy back; nothing of sets that are all boundary, such as row sums."""
+    inside, outside = (bool(problem.feasible_set.contains(M * scale, NUDGE / 100)) for scale in (1 - NUDGE, 1 + NUDGE))
+    if outside or not inside:
+        return []
+    return ["the policy lies on the boundary of the feasible set: a larger set may have another one"]
 
 
 def said(cost: dict[str, Any]) -> str:
