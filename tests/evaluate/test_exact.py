@@ -78,7 +78,7 @@ def test_cost_derivative_in_a_squared_scale_matches_its_closed_form():
     derivative = jax.jit(jax.grad(cost))(theta)
     Lambda = np.asarray(cost_to_go(c.problem, c.deployed).Lambda)
     P = np.asarray(pc.state_moments(c.problem, c.M, deployed=c.deployed).second)[:, :2, :2]
-    expected = [[np.trace(D[k].T @ Lambda[t + 1] @ D[k] @ P[t]) for k in range(2)] for t in range(T)]
+    expected = [[np.trace(D[k].T @ Lambda[t] @ D[k] @ P[t]) for k in range(2)] for t in range(T)]
     assert_close(derivative, expected, 1e-11)
 
 

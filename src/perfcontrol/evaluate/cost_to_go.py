@@ -24,27 +24,42 @@ from perfcontrol.problem import PerformativeProblem
 class CostToGo(eqx.Module):
     """What the deployed policy makes of the world; none of it depends on the evaluated policy.
 
-    Lambda: (T+1, n, n) cost-to-go. S: (T+1, m, m) curvature in the feedforward v_t. D: (T+1, m, n) its coupling to
-    the state. R, N: the parts of S and D that are not BᵀΛB and BᵀΛF: stage cost and perturbation of the input; with
-    the axis T+1 where they vary, N None where there is no coupling. F: (n, n) mean closed loop, B: (n, m) mean input
-    matrix, Θ included; with the axis T where they vary. noise_mean: (n,) or (T, n) and noise_covariance: (n, n) or
-    (T, n, n), of the law of w_t.
+    first: Λ_0, (n, n). Lambda: Λ_1, ..., Λ_T, (T, n, n), the cost-to-go of what an input leads to. R (m, m), N (m, n):
+    the parts of S and D that are not BᵀΛB and BᵀΛF: stage cost and perturbation of the input; with the axis T+1 where
+    they vary, N None where there is no coupling. F: (n, n) mean closed loop, B: (n, m) mean input matrix, Θ included;
+    with the axis T where they vary. noise_mean: (n,) or (T, n) and noise_covariance: (n, n) or (T, n, n), of the law
+    of w_t.
     """
 
-    Lambda: Float[Array, "T1 n n"]
+    first: Float[Array, "n n"]
+    Lambda: Float[Array, "T n n"]
     R: Float[Array, "*steps m m"]
     N: Float[Array, "*between m n"] | None
-    S: Float[Array, "T1 m m"]
-    D: Float[Array, "T1 m n"]
     F: Matrix
     B: Matrix
     noise_mean: Float[Array, "*time n"]
     noise_covariance: Float[Array, "*times n n"]
 
+    @property
+    def S(self) -> Float[Array, "T1 m m"]:
+        """R_t + BᵀΛ_{t+1}B: curvature in the feedforward v_t; nothing lies ahead of the last one."""
+        return self._with_stage(self.R, transpose(self.Lambda @ self.B) @ self.B)
+
+    @property
+    def D(self) -> Float[Array, "T1 m n"]:
+        """N_t + BᵀΛ_{t+1}F: its coupling to the state."""
+        return self._with_stage(self.N, transpose(self.Lambda @ self.B) @ self.F)
+
+    def _with_stage(self, stage: Array | None, moved: Array) -> Array:
+        if stage is None:
+            return jnp.pad(moved, ((0, 1), (0, 0), (0, 0)))
+        stages: Array = along_time(stage, 2, len(moved) + 1)
+        return jnp.concatenate([stages[:-1] + moved, stages[-1:]])
+
 
 def cost_to_go(problem: PerformativeProblem, reacting: Array) -> CostToGo:
     """The backward recursion under the lifted deployed policy `reacting`."""
-    n, T = problem.state_size, problem.horizon
+    n = problem.state_size
     F, B, on_x, between, on_v, spread, state_part = closed_loop(problem, reacting)
     varying, on_input = F.ndim == 3, state_part is not None
     spread_steps, backward = (spread.steps, None) if varying or on_input else spread.backward(F)
@@ -57,31 +72,19 @@ def cost_to_go(problem: PerformativeProblem, reacting: Array) -> CostToGo:
             reaction = spread.adjoint_step(spread_t, Lambda)
             moved = congruence(F_t if varying else F, Lambda)
             moved = moved + (congruence(state_part_t, reaction) if on_input else reaction)
-        previous = (on_x if stage_t is None else stage_t) + moved
-        return previous, previous
+        return (on_x if stage_t is None else stage_t) + moved, Lambda
 
     last = symmetrise(on_x if on_x.ndim == 2 else on_x[-1])
     stages = on_x[:-1] if on_x.ndim == 3 else None
     steps = (F if varying else None, stages, spread_steps, state_part)
-    _, earlier = jax.lax.scan(retreat, last, steps, reverse=True)
-    Lambda = jnp.concatenate([earlier, last[None]])
+    first, Lambda = jax.lax.scan(retreat, last, steps, reverse=True)
     if state_part is not None:
-        reaction = spread.adjoint(Lambda[1:])[:, n:, :]
+        reaction = spread.adjoint(Lambda)[:, n:, :]
         last_stage = ((0, 1), (0, 0), (0, 0))  # nothing reacts after it
         on_v = on_v + jnp.pad(reaction[:, :, n:], last_stage)
         between = jnp.pad(reaction @ state_part, last_stage) + (0 if between is None else between)
-    # What couples to v needs no recursion: in bulk over time.
-    pulled = transpose(Lambda[1:] @ B)
-
-    def with_stage(stage: Array | None, moved: Array) -> Array:
-        if stage is None:
-            return jnp.pad(moved, ((0, 1), (0, 0), (0, 0)))
-        stages: Array = along_time(stage, 2, T + 1)
-        return jnp.concatenate([stages[:-1] + moved, stages[-1:]])
-
-    S, D = with_stage(on_v, pulled @ B), with_stage(between, pulled @ F)
     noise = problem.noise_under(reacting)
-    return CostToGo(Lambda, on_v, between, S, D, F, B, noise.mean, noise.covariance)
+    return CostToGo(first, Lambda, on_v, between, F, B, noise.mean, noise.covariance)
 
 
 World = CostToGo | StationaryWorld

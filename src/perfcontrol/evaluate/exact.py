@@ -37,7 +37,7 @@ def cost_and_gradient(problem: PerformativeProblem, world: World, policy: Array)
     cost, gradient = impulses(world, policy, covariance)
     w = along_time(mean, 1, problem.horizon)
     deterministic, by_v = mean_path(problem, world, feedforward(policy, w), w, problem.initial_state.mean)
-    start = jnp.sum(world.Lambda[0] * problem.initial_state.covariance)
+    start = jnp.sum(world.first * problem.initial_state.covariance)
     return cost + deterministic + start, gradient + feedforward_adjoint(by_v, w, problem.memory)
 
 

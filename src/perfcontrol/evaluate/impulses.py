@@ -29,7 +29,7 @@ def _chains(world: CostToGo, memory: int) -> tuple[list[Array], list[Array]]:
 
     X[0] = S and X[d] = Y[d-1]_t B_{t-d}, (H, T+1, m, m); zero where t < d.
     """
-    length = world.S.shape[0]
+    length = len(world.Lambda) + 1
 
     def shifted(matrices: Matrix, d: int) -> Matrix:
         """matrices_{t-d} for t = 0..T, zero where t < d."""
@@ -56,7 +56,7 @@ def tail_sums(matrices: Array, memory: int, length: int) -> Array:
 
 def _chain_tails(world: CostToGo, memory: int) -> tuple[Array, Array]:
     """Σ_{t ≥ j} X[d]_t at index [d, j-1], (H, H, m, m), and Σ_{t > d} Y[d]_t, (H, m, n)."""
-    length = world.S.shape[0]
+    length = len(world.Lambda) + 1
     if world.F.ndim == 3 or world.B.ndim == 3:
         Y, X = _chains(world, memory)
         # Y[d]_t is zero for t < d, and t = d would be the impulse w_{-1}.
@@ -64,7 +64,7 @@ def _chain_tails(world: CostToGo, memory: int) -> tuple[Array, Array]:
         return jnp.stack([tail_sums(x, memory, length) for x in X]), over_time
     # The same matrices at every time: the sums come first, and nothing but Λ needs a pass over time.
     F, B = as_dense(world.F), as_dense(world.B)
-    pulled = transpose(B) @ tail_sums(world.Lambda[1:], memory, length - 1)
+    pulled = transpose(B) @ tail_sums(world.Lambda, memory, length - 1)
     curvature = pulled @ B + tail_sums(world.R, memory, length)
     coupling = pulled @ F if world.N is None else pulled @ F + tail_sums(world.N, memory, length)
     Y, X = [coupling], [curvature]
@@ -76,11 +76,11 @@ def _chain_tails(world: CostToGo, memory: int) -> tuple[Array, Array]:
 
 def impulse_form(world: World, memory: int) -> ImpulseForm:
     """The blocks summed over impulses, by tail sums over time; in the stationary limit those of one impulse."""
-    m = world.S.shape[-1]
+    m = world.B.shape[-1]
     if isinstance(world, StationaryWorld):
         (X, Y), a = world.chains(memory), world.Lambda
     else:
-        (X, Y), a = _chain_tails(world, memory), jnp.sum(world.Lambda[1:], axis=0)
+        (X, Y), a = _chain_tails(world, memory), jnp.sum(world.Lambda, axis=0)
     row, column = jnp.meshgrid(jnp.arange(memory), jnp.arange(memory), indexing="ij")
     blocks = X[jnp.abs(row - column), jnp.maximum(row, column)]
     blocks = jnp.where((row >= column)[..., None, None], blocks, transpose(blocks))
@@ -109,7 +109,7 @@ def varying_impulses(world: CostToGo, M: Array, covariance: Array) -> tuple[Arra
             if d:
                 curved[j - 1 - d] += jnp.einsum("tba,tbn->an", block, fed[j - 1])
     linear_all, curved_all = jnp.stack(linear), jnp.stack(curved)
-    constant = jnp.einsum("tij,tji->", world.Lambda[1:], covariance)
+    constant = jnp.einsum("tij,tji->", world.Lambda, covariance)
     return constant + jnp.sum(M * (2 * linear_all + curved_all)), 2 * (linear_all + curved_all)
 
 

@@ -27,7 +27,7 @@ def mean_path(problem: PerformativeProblem, world: CostToGo, v: Array, w: Array,
     cost = problem.cost
     assert isinstance(cost, QuadraticCost)
     push = input_term(world.B, v) + w
-    moved = matvec(world.Lambda[1:], push)
+    moved = matvec(world.Lambda, push)
     source, by_input_stage, constant = jnp.zeros((T + 1, n), v.dtype), 0, 0
     if cost.has_targets:
         linear, constant = cost.linear_terms(T)
@@ -51,10 +51,10 @@ def mean_path(problem: PerformativeProblem, world: CostToGo, v: Array, w: Array,
 
     _, mu = jax.lax.scan(advance, x0, (F, push))
     # x' Λ x + 2 p' x is what lies ahead: each push adds its own to it, and by_v is what it adds at the margin.
-    total = x0 @ (world.Lambda[0] @ x0 + 2 * p0) + jnp.sum(push * (moved + 2 * p_next)) + jnp.sum(constant)
+    total = x0 @ (world.first @ x0 + 2 * p0) + jnp.sum(push * (moved + 2 * p_next)) + jnp.sum(constant)
     weighed = v @ world.R if world.R.ndim == 2 else matvec(world.R, v)
     total = total + jnp.sum(v * (weighed + 2 * by_input_stage))
-    margin = input_adjoint(world.B, matvec(world.Lambda[1:], mu) + p_next)
+    margin = input_adjoint(world.B, matvec(world.Lambda, mu) + p_next)
     by_v = weighed + by_input_stage + jnp.pad(margin, ((0, 1), (0, 0)))
     if world.N is not None:
         states = jnp.concatenate([x0[None], mu])
@@ -66,9 +66,9 @@ def sustained_form(world: World, memory: int) -> Array:
     """(H m, H m): the quadratic form that constant feedforwards ṽ_i, held from time i on, meet (i = 1..H)."""
     if isinstance(world, StationaryWorld):  # in the long run the lags do not differ
         return jnp.tile(world.sustained(), (memory, memory))
-    length, m = world.S.shape[0], world.S.shape[-1]
+    length, m = len(world.Lambda) + 1, world.B.shape[-1]
     size = memory * m
-    active = (jnp.arange(length)[:, None] >= jnp.arange(1, memory + 1)).astype(world.S.dtype)  # (T+1, H)
+    active = (jnp.arange(length)[:, None] >= jnp.arange(1, memory + 1)).astype(world.Lambda.dtype)  # (T+1, H)
     B = as_dense(along_time(world.B, 2, length - 1))
     varying = world.F.ndim == 3
 

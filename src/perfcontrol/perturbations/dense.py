@@ -16,6 +16,7 @@ from perfcontrol.perturbations.base import (
     DenseDraws,
     Draws,
     PathDraws,
+    varying,
     zero_mean,
 )
 from perfcontrol.perturbations.dependence import as_scale, check_values
@@ -55,17 +56,21 @@ class _White(eqx.Module):
 class _WhiteCovariance(CovarianceOperator):
     """Entries uncorrelated: E[(S∘Z) X (S∘Z)ᵀ] = diag_i(Σ_a S_ia² X_aa)."""
 
-    variances: Array  # (T, n, p)
+    variances: Array  # (n, p) or (T, n, p)
+    times: Array  # (T, 0): carries the horizon
 
     @property
     def steps(self) -> Any:
-        return self.variances
+        return self.times, varying(self.variances)
+
+    def _at(self, step: Any) -> Array:
+        return self.variances if step[1] is None else step[1]
 
     def apply_step(self, step: Any, X: Array) -> Array:
-        return jnp.diag(step @ jnp.diagonal(X))
+        return jnp.diag(self._at(step) @ jnp.diagonal(X))
 
     def adjoint_step(self, step: Any, X: Array) -> Array:
-        return jnp.diag(jnp.diagonal(X) @ step)
+        return jnp.diag(jnp.diagonal(X) @ self._at(step))
 
 
 class _ColouredCovariance(CovarianceOperator):
@@ -194,10 +199,11 @@ class DensePerturbation(AbstractPerturbation):
         return None if self.mean_map is None and self.law is None else self.mean(M, horizon)
 
     def covariance(self, M: Array, horizon: int) -> CovarianceOperator:
-        scales = self.scales(M, horizon)
+        values, shape = self._values(M), self._shape(M)
         if self.law is None:
-            return _WhiteCovariance(scales**2)
-        shape = self._shape(M)
+            squares = jnp.broadcast_to(values**2, (*values.shape[:-2], *shape))
+            return _WhiteCovariance(squares, jnp.zeros((horizon, 0), values.dtype))
+        scales = self.scales(M, horizon)
         return _ColouredCovariance(scales, self._vector(M).covariance.reshape(*shape, *shape))
 
     def policy_free_mean(self, feasible_set: Any) -> bool:

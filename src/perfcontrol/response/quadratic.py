@@ -84,14 +84,14 @@ def factors(problem: PerformativeProblem, world: World) -> Factors:
     if known(w) and not np.any(w):  # nothing has a mean that the policy could act on
         linear = 2 * (form.F @ Sigma).reshape(problem.lifted_shape)
         return Factors(linear, form.G, 0 * form.G, Sigma, w)
-    linear = weigh(problem, world, np.zeros(problem.policy_shape, world.S.dtype))[1]
+    linear = weigh(problem, world, np.zeros(problem.policy_shape, world.Lambda.dtype))[1]
     return Factors(linear, form.G, _sustained_form(world, problem.memory), Sigma, w)
 
 
 @program
 def quadratic(problem: PerformativeProblem, world: World) -> Quadratic:
     """The quadratic of a given world, its Hessian as a matrix."""
-    zero = jnp.zeros(problem.policy_shape, world.S.dtype)
+    zero = jnp.zeros(problem.policy_shape, world.Lambda.dtype)
     linear = weigh(problem, world, zero)[1]
     matrix = _hessian_matrix(problem, world, linear)
     return Quadratic(linear, 1 / _largest_eigenvalue(matrix), matrix)
@@ -106,7 +106,7 @@ def quadratic_by_passes(problem: PerformativeProblem, world: World) -> Quadratic
     def gradient(M: Array) -> Array:
         return weigh(problem, world, M)[1]
 
-    linear = gradient(jnp.zeros(problem.policy_shape, world.S.dtype))
+    linear = gradient(jnp.zeros(problem.policy_shape, world.Lambda.dtype))
     return Quadratic(linear, 1 / _power_iteration(gradient, linear), None, gradient)
 
 

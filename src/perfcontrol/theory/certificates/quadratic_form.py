@@ -113,7 +113,7 @@ def expansions(problem: PerformativeProblem, variances: np.ndarray, along: np.nd
     base, dtype = nearest_to_zero(problem), problem.dtype
     world, derivative = _worlds(problem, base, variances.astype(dtype), along.astype(dtype))
     zeros = eqx.tree_at(
-        lambda w: (w.Lambda, w.R, w.N, w.S, w.D),
+        lambda w: (w.first, w.Lambda, w.R, w.N),
         derivative,
         replace_fn=lambda leaf: None if leaf is None else np.zeros_like(leaf),
         is_leaf=lambda leaf: leaf is None,
