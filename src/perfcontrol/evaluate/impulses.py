@@ -50,7 +50,8 @@ def tail_sums(matrices: Array, memory: int, length: int) -> Array:
     """Σ_{t ≥ j} of matrices_t for j = 1..memory, t up to length - 1; without a time axis, the same at every t."""
     if matrices.ndim == 2:
         return jnp.arange(length - 1, length - 1 - memory, -1, dtype=matrices.dtype)[:, None, None] * matrices
-    parts = jnp.concatenate([matrices[1:memory], jnp.sum(matrices[memory:], axis=0)[None]])
+    late = (jnp.arange(length) >= memory).astype(matrices.dtype)
+    parts = jnp.concatenate([matrices[1:memory], jnp.tensordot(late, matrices, 1)[None]])  # faster than any sum
     return jnp.flip(jnp.cumsum(jnp.flip(parts, axis=0), axis=0), axis=0)
 
 
@@ -68,10 +69,10 @@ def _chain_tails(world: CostToGo, memory: int) -> tuple[Array, Array]:
     curvature = pulled @ B + tail_sums(world.R, memory, length)
     coupling = pulled @ F if world.N is None else pulled @ F + tail_sums(world.N, memory, length)
     Y, X = [coupling], [curvature]
-    for _ in range(1, memory):
-        X.append(Y[-1] @ B)
-        Y.append(Y[-1] @ F)
-    return jnp.stack(X), jnp.stack([y[d] for d, y in enumerate(Y)])
+    for d in range(1, memory):  # lag j meets j - d where j ≥ d: Y loses its first
+        X.append(jnp.pad(Y[-1][1:] @ B, ((d, 0), (0, 0), (0, 0))))
+        Y.append(Y[-1][1:] @ F)
+    return jnp.stack(X), jnp.stack([y[0] for y in Y])
 
 
 def impulse_form(world: World, memory: int) -> ImpulseForm:
@@ -80,7 +81,8 @@ def impulse_form(world: World, memory: int) -> ImpulseForm:
     if isinstance(world, StationaryWorld):
         (X, Y), a = world.chains(memory), world.Lambda
     else:
-        (X, Y), a = _chain_tails(world, memory), jnp.sum(world.Lambda, axis=0)
+        ones = jnp.ones(len(world.Lambda), world.Lambda.dtype)
+        (X, Y), a = _chain_tails(world, memory), jnp.tensordot(ones, world.Lambda, 1)
     row, column = jnp.meshgrid(jnp.arange(memory), jnp.arange(memory), indexing="ij")
     blocks = X[jnp.abs(row - column), jnp.maximum(row, column)]
     blocks = jnp.where((row >= column)[..., None, None], blocks, transpose(blocks))

@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 import scipy.linalg
 
-from perfcontrol._programs import numerics
+from perfcontrol._programs import cond, numerics
 
 EIGENVALUES = 512  # rows up to which all eigenvalues are computed
-ROUNDS = 12  # of power iteration; what it leaves open is far below the margin of `regular`
+ROUNDS = 12  # of power iteration
+INVERSE_ROUNDS = 4  # on the inverse: where the margin of `regular` is near, one eigenvalue outdoes all others
 
 
 class Definite:
@@ -32,8 +33,8 @@ class Definite:
             self._values = xp.where(values > 0, values, 1)
         else:
             self._factor, definite = _cholesky(matrix, xp, linalg)
-            self.largest = xp.minimum(1.1 * _power(lambda v: matrix @ v, len(matrix), xp), xp.trace(matrix))
-            inverse = _power(lambda v: linalg.cho_solve((self._factor, True), v), len(matrix), xp)
+            self.largest = xp.minimum(1.1 * _power(lambda v: matrix @ v, len(matrix), ROUNDS, xp), xp.trace(matrix))
+            inverse = _power(self._solve_columns, len(matrix), INVERSE_ROUNDS, xp)
             smallest = xp.where(definite, 1 / inverse, 0)
         self.regular = smallest > margin * self.largest
 
@@ -41,9 +42,11 @@ class Definite:
         """matrix⁻¹ right, for right (..., k, n)."""
         if self._size <= EIGENVALUES:
             return self._vectors @ ((self._vectors.T @ right) / self._values[:, None])
-        columns = right.swapaxes(-1, -2).reshape(-1, self._size).T
-        solved = self._linalg.cho_solve((self._factor, True), columns)
+        solved = self._solve_columns(right.swapaxes(-1, -2).reshape(-1, self._size).T)
         return solved.T.reshape(*right.shape[:-2], right.shape[-1], self._size).swapaxes(-1, -2)
+
+    def _solve_columns(self, columns: Any) -> Any:
+        return self._linalg.cho_solve((self._factor, True), columns, check_finite=False)
 
 
 def _cholesky(matrix: Any, xp: Any, linalg: Any) -> tuple[Any, Any]:
@@ -51,16 +54,16 @@ def _cholesky(matrix: Any, xp: Any, linalg: Any) -> tuple[Any, Any]:
     try:
         factor = linalg.cholesky(matrix, lower=True)
     except scipy.linalg.LinAlgError:  # JAX gives NaN instead
-        factor = np.full_like(matrix, np.nan)
-    definite = xp.all(xp.isfinite(factor))
-    return xp.where(definite, factor, xp.eye(len(matrix), dtype=matrix.dtype)), definite
+        return np.eye(len(matrix), dtype=matrix.dtype), np.asarray(False)
+    definite = xp.all(xp.isfinite(xp.diagonal(factor)))
+    return cond(definite, lambda: factor, lambda: xp.eye(len(matrix), dtype=matrix.dtype)), definite
 
 
-def _power(apply: Any, size: int, xp: Any) -> Any:
+def _power(apply: Any, size: int, rounds: int, xp: Any) -> Any:
     """‖apply‖ from below, by power iteration from a vector that no structure is orthogonal to."""
     v = xp.asarray(np.random.default_rng(0).normal(size=size))
     norm = xp.linalg.norm(v)
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         v = apply(v / xp.where(norm > 0, norm, 1))
         norm = xp.linalg.norm(v)
     return norm

@@ -83,7 +83,7 @@ def factors(problem: PerformativeProblem, world: World) -> Factors:
     Sigma, w = on_host((world.noise_covariance, world.noise_mean))
     if known(w) and not np.any(w):  # nothing has a mean that the policy could act on
         linear = 2 * (form.F @ Sigma).reshape(problem.lifted_shape)
-        return Factors(linear, form.G, 0 * form.G, Sigma, w)
+        return Factors(linear, form.G, numerics(form.G)[0].zeros_like(form.G), Sigma, w)
     linear = weigh(problem, world, np.zeros(problem.policy_shape, world.Lambda.dtype))[1]
     return Factors(linear, form.G, _sustained_form(world, problem.memory), Sigma, w)
 

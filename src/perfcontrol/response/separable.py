@@ -35,8 +35,9 @@ class Separable:
         a = self.inverse_root @ w
         squared = a @ a
         self.unit = a / xp.sqrt(xp.where(squared > 0, squared, 1))
-        shift = xp.where(self.regular, 0, 1).astype(G.dtype) * xp.eye(H * m, dtype=G.dtype)
-        self.along = G + squared * G_mean + shift
+        if not self.centred:
+            shift = xp.where(self.regular, 0, 1).astype(G.dtype) * xp.eye(H * m, dtype=G.dtype)
+            self.along = G + squared * G_mean + shift
 
     def _separately(self, gradients: Any) -> Any:
         """Newton steps for gradients (k, H, m, n)."""
