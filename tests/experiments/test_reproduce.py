@@ -25,7 +25,7 @@ from perfcontrol.reports.paper import judge, regimes, theorems
 from tests.tools import normal
 
 SETTINGS = ReproduceSettings(seeds=3, steps=100, cure_steps=200, sweep_seeds=2, sweep_steps=100)
-STAGES = ("exact", "exact_simplex", "optimum", "runs", "cure", "sweep")
+STAGES = ("exact", "exact_simplex", "optimum", "floors", "runs", "cure", "sweep")
 
 
 @pytest.fixture(scope="module")
@@ -97,8 +97,8 @@ def test_costs_of_runaway_policies_are_the_ceiling() -> None:
 
 def test_smaller_step_ends_on_the_floor_that_the_theory_gives(done: tuple[Path, Outcome]) -> None:
     """Quoted: trace of the stationary covariance by the same operator on 512 sampled Jacobians."""
-    cure = results.load_dataset(done[0] / "cure.nc")
-    floors = [float(cure["floor_smaller"].sel(order=order)) for order in ("ascending", "random", "descending")]
+    found = results.load_dataset(done[0] / "floors.nc")
+    floors = [float(found["floor_smaller"].sel(order=order)) for order in ("ascending", "random", "descending")]
     np.testing.assert_allclose(floors, [0.202, 0.889, 2.223], rtol=0.1)
 
 
@@ -118,7 +118,12 @@ def test_claims_are_complete_and_existence_is_settled(done: tuple[Path, Outcome]
 
 def test_without_the_simplex_its_claim_and_its_curve_are_left_out(done: tuple[Path, Outcome], tmp_path: Path) -> None:
     data = {name: results.load_dataset(done[0] / f"{name}.nc") for name in STAGES}
-    exact, runs, sweep, cure = data["exact"], data["runs"], data["sweep"], data["cure"].drop_vars("simplex")
+    exact, runs, sweep, cure = (
+        data["exact"],
+        data["runs"],
+        data["sweep"],
+        data["cure"].drop_vars("simplex").merge(data["floors"]),
+    )
     claims = judge(exact, None, data["optimum"], runs, cure, sweep, SETTINGS)
     missing = {claim.claim for claim in done[1].claims} - {claim.claim for claim in claims}
     assert len(missing) == 1

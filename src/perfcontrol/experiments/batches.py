@@ -5,6 +5,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from perfcontrol.problem import PerformativeProblem
@@ -12,7 +13,9 @@ from perfcontrol.problem import PerformativeProblem
 
 def in_single_precision(problem: PerformativeProblem) -> PerformativeProblem:
     """The problem with every floating-point array in float32."""
-    return jax.tree.map(lambda leaf: leaf.astype(jnp.float32) if eqx.is_inexact_array(leaf) else leaf, problem)
+    return jax.tree.map(
+        lambda leaf: jnp.asarray(np.asarray(leaf, np.float32)) if eqx.is_inexact_array(leaf) else leaf, problem
+    )
 
 
 class StepRule(eqx.Module):

@@ -21,20 +21,16 @@ OPTIMUM: Any = {"linestyle": (0, (6, 2, 1, 2)), "linewidth": 0.9}
 CEILING = 1e4  # of the error axis, relative to the first error: beyond it a run has left for good
 
 
-def draw_all(
-    out: Path,
-    optimum: xarray.Dataset,
-    runs: xarray.Dataset,
-    cure: xarray.Dataset,
-    sweep: xarray.Dataset,
-    settings: ReproduceSettings,
-) -> list[Path]:
-    """Figures 1, 2 and 3 as PNG and SVG."""
+def draw_runs(out: Path, runs: xarray.Dataset, optimum: xarray.Dataset) -> list[Path]:
+    """Figures 1 and 2 as PNG and SVG."""
     with styled():
-        files = figure_error(runs, out / "figure1_error")
-        files += figure_cost(runs, optimum, out / "figure2_cost")
-        files += figure_cure(cure, sweep, settings, out / "figure3_cure")
-    return files
+        return figure_error(runs, out / "figure1_error") + figure_cost(runs, optimum, out / "figure2_cost")
+
+
+def draw_cure(out: Path, cure: xarray.Dataset, sweep: xarray.Dataset, settings: ReproduceSettings) -> list[Path]:
+    """Figure 3 as PNG and SVG."""
+    with styled():
+        return figure_cure(cure, sweep, settings, out / "figure3_cure")
 
 
 def _quantiles(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -103,11 +103,11 @@ def save_figure(figure: Figure, path: Path) -> list[Path]:
     if engine is not None:  # once for both files: the layout takes longer than the drawing
         engine.execute(figure)
         figure.set_layout_engine("none")
-    files = []
+    around, files = figure.get_tightbbox().padded(0.1), []  # inches; likewise
     for suffix in (".png", ".svg"):
         target = path.with_name(path.name + suffix)
         with written_whole(target) as temporary:
-            figure.savefig(temporary, bbox_inches="tight", metadata={"Date": None} if suffix == ".svg" else None)
+            figure.savefig(temporary, bbox_inches=around, metadata={"Date": None} if suffix == ".svg" else None)
         files.append(target)
     plt.close(figure)
     return files

@@ -14,7 +14,7 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array
 
-from perfcontrol._programs import program
+from perfcontrol._programs import known, program
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.solvers.base import AbstractSolver, State
 from perfcontrol.solvers.result import Result
@@ -43,7 +43,12 @@ class Rows(NamedTuple):
 
 def pick(stack: Any, index: Any) -> Any:
     """One member of a stack, or the stack of several."""
-    return jax.tree.map(lambda leaf: leaf[index] if eqx.is_array(leaf) else leaf, stack)
+
+    def picked(leaf: Any) -> Any:
+        # What is known is picked on the host: JAX would compile a program for each shape.
+        return jnp.asarray(np.asarray(leaf)[index]) if known(leaf, index) else leaf[index]
+
+    return jax.tree.map(lambda leaf: picked(leaf) if eqx.is_array(leaf) else leaf, stack)
 
 
 def on_devices(function: Callable[..., Any], lanes: int, shared: Any, rows: Any) -> Any:

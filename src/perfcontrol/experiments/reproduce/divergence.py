@@ -44,7 +44,6 @@ def cure_stage(
         data[name] = (("order", "seed", f"step_{name}"), errors[..., 1:])
         data[f"step_{name}"] = ((f"step_{name}",), np.arange(1, steps + 1))
         before += steps
-    data["floor_smaller"] = (("order",), error_floors(settings, lab.exact, SMALL_STEP * step))
     return xarray.Dataset(data, coords={"order": list(ORDERS), "seed": np.arange(settings.cure_seeds)})
 
 
@@ -91,15 +90,14 @@ def computed_thresholds(settings: ReproduceSettings, exact: xarray.Dataset) -> n
     return HORIZON * np.asarray([found.threshold_estimate for found in _stability(settings, exact, 1024)])
 
 
-def error_floors(settings: ReproduceSettings, exact: xarray.Dataset, step: float) -> np.ndarray:
-    """Where a constant step on the stage average leaves E ‖M_n - M^PS‖² in the long run, by order; inf for nowhere."""
-    summed = step / HORIZON
-    return np.asarray(
-        [
-            found.error_floor(summed) if summed < found.threshold_estimate else np.inf
-            for found in _stability(settings, exact, FLOOR_SAMPLES)
-        ]
-    )
+def floors_stage(settings: ReproduceSettings, exact: xarray.Dataset) -> xarray.Dataset:
+    """Where the smaller constant step leaves E ‖M_n - M^PS‖² in the long run; inf for nowhere."""
+    summed = SMALL_STEP * settings.step_size / HORIZON
+    floors = [
+        found.error_floor(summed) if summed < found.threshold_estimate else np.inf
+        for found in _stability(settings, exact, FLOOR_SAMPLES)
+    ]
+    return xarray.Dataset({"floor_smaller": (("order",), floors)}, coords={"order": list(ORDERS)})
 
 
 def _stability(settings: ReproduceSettings, exact: xarray.Dataset, samples: int) -> list[MeanSquareStability]:

@@ -18,7 +18,6 @@ from perfcontrol.problem import PerformativeProblem
 from perfcontrol.random_keys import fast_key
 from perfcontrol.solvers import RSGD, Solution, solve_many
 from perfcontrol.solvers.result import MEMBERS
-from perfcontrol.solvers.rows import pick
 from perfcontrol.solvers.runs import identity
 
 DIMINISHING_OFFSET = 10.0  # η_n = step 10 / (n + 10)
@@ -30,9 +29,9 @@ class Laboratory(NamedTuple):
     Runs are in single precision: its rounding is far below their sampling noise, and they take half the time.
     """
 
-    problems: PerformativeProblem  # stacked
+    problems: PerformativeProblem  # stacked, on the host
     exact: xarray.Dataset
-    starts: Array  # (seeds, 1, stocks, stocks)
+    starts: np.ndarray  # (seeds, 1, stocks, stocks)
     root: Array
 
     def run(
@@ -41,14 +40,14 @@ class Laboratory(NamedTuple):
         """RSGD in some cases, or one; `stream` has the axes of the answer, the last one the seeds, and with `stage`
         says which random numbers each run uses.
         """
-        keys = jax.vmap(lambda number: jax.random.fold_in(self.root, number))(stage * 1_000_000 + stream.reshape(-1))
+        keys = _keys(self.root, stage * 1_000_000 + stream)
         solvers = [RSGD(1, rule) for rule in rules] if isinstance(rules, list) else RSGD(1, rules)
         starts = self.starts[: stream.shape[-1]].reshape(*(1,) * (stream.ndim - 1), -1, *self.starts.shape[1:])
         return solve_many(
-            pick(self.problems, cases),
+            jax.tree.map(lambda leaf: jnp.asarray(leaf[cases]), self.problems),
             solvers,
             starts,
-            keys=keys.reshape(stream.shape),
+            keys=keys,
             max_steps=steps,  # so that stages of other lengths need not be compiled anew
             record=identity,
             progress=lambda done, total: show(done / total),
@@ -63,10 +62,17 @@ class Laboratory(NamedTuple):
 
 def laboratory(settings: ReproduceSettings, problems: list[PerformativeProblem], exact: xarray.Dataset) -> Laboratory:
     """The laboratory of one feasible set."""
-    stacked = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *problems)
+    stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *map(in_single_precision, problems))
     seeds = max(settings.seeds, settings.cure_seeds, settings.sweep_seeds)
     starts = starts_of(settings, problems[0], seeds).astype(np.float32)
-    return Laboratory(in_single_precision(stacked), exact, jnp.asarray(starts), fast_key(settings.seed))
+    return Laboratory(stacked, exact, starts, fast_key(settings.seed))
+
+
+@jax.jit
+def _keys(root: Array, numbers: Array) -> Array:
+    """The key of each number."""
+    fold = jax.vmap(lambda number: jax.random.fold_in(root, number))
+    return fold(numbers.reshape(-1)).reshape(numbers.shape)
 
 
 def constant_step(step: Any) -> StepRule:

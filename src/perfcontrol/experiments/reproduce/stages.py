@@ -5,11 +5,14 @@ import json
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
 import xarray
 
 from perfcontrol import results
 from perfcontrol.config import ReproduceSettings
+
+Value = TypeVar("Value")
 
 
 class Stages:
@@ -31,9 +34,18 @@ class Stages:
             if dataset is not None and dataset.attrs.get("fingerprint") == self.fingerprint:
                 self.seconds[name] = 0.0
                 return dataset
+
+        def computed() -> xarray.Dataset:
+            dataset = compute()
+            attributes = {"settings": self.settings.model_dump(), "fingerprint": self.fingerprint}
+            results.save_dataset(dataset, path, attributes)
+            return dataset
+
+        return self.timed(name, computed)
+
+    def timed(self, name: str, work: Callable[[], Value]) -> Value:
+        """What `work` gives, the seconds that it took added to those of the stage."""
         began = time.monotonic()
-        dataset = compute()
-        attributes = {"settings": self.settings.model_dump(), "fingerprint": self.fingerprint}
-        results.save_dataset(dataset, path, attributes)
-        self.seconds[name] = time.monotonic() - began
-        return dataset
+        value = work()
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.monotonic() - began
+        return value

@@ -4,7 +4,7 @@ import numpy as np
 import xarray
 
 from perfcontrol.config import ReproduceSettings
-from perfcontrol.reports.claims import Claim, bootstrap, loglog_slope, wilson
+from perfcontrol.reports.claims import Claim, bootstrap, loglog_slope, median, wilson
 from perfcontrol.reports.paper.statistics import SECTION, listed, orders, relative_error, worst
 
 FAR_ORDERS = ("descending", "random")
@@ -40,7 +40,7 @@ def inverse_rate(runs: xarray.Dataset, settings: ReproduceSettings) -> Claim:
     window = np.unique(np.geomspace(max(steps[-1] // 4, 10), steps[-1], 40).astype(int))
 
     def slope(rows: np.ndarray) -> float:
-        return loglog_slope(window, np.median(rows[:, window], axis=0))
+        return loglog_slope(window, median(rows[:, window]))
 
     values = {order: bootstrap(runs["error"].sel(regime="stable", order=order).values, slope) for order in orders(runs)}
     name, value, interval = worst(values)
@@ -63,7 +63,7 @@ def cost_converges(runs: xarray.Dataset, regime: str, panel: str) -> Claim:
     quarter = runs.sizes["step"] // 4
 
     def drift(rows: np.ndarray) -> float:
-        middle = np.median(rows, axis=0)
+        middle = median(rows)
         return abs(np.mean(middle[-quarter:]) - np.mean(middle[-2 * quarter : -quarter])) / np.ptp(middle)
 
     values, levels = {}, {}

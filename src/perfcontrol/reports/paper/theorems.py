@@ -4,7 +4,7 @@ import numpy as np
 import xarray
 
 from perfcontrol.config import ReproduceSettings
-from perfcontrol.reports.claims import Claim, Verdict, bootstrap, loglog_slope
+from perfcontrol.reports.claims import Claim, Verdict, bootstrap, loglog_slope, median
 from perfcontrol.reports.paper.statistics import SECTION, listed, orders, worst
 
 
@@ -39,7 +39,7 @@ def theorem(cure: xarray.Dataset, settings: ReproduceSettings) -> Claim:
     window = np.unique(np.geomspace(max(steps[-1] // 10, 10), steps[-1], 40).astype(int)) - 1
 
     def slope(rows: np.ndarray) -> float:
-        return loglog_slope(steps[window], np.median(rows[:, window], axis=0))
+        return loglog_slope(steps[window], median(rows[:, window]))
 
     values = {order: bootstrap(cure["diminishing"].sel(order=order).values, slope) for order in orders(cure)}
     name, value, interval = worst(values)
