@@ -70,6 +70,20 @@ def rmatvec(matrix: "Matrix", vector: Array) -> Array:
     return jnp.einsum("...ij,...i->...j", matrix, vector)
 
 
+def times(matrix: "Matrix", z: Array) -> Array:
+    """`matrix @ z` in a loop over time: z (p,), or (p, paths) beside a matrix (n, p, paths) or (n, p, 1)."""
+    if z.ndim == 1 or isinstance(matrix, Diagonal):
+        return matvec(matrix, z)
+    return jnp.sum(matrix * z, axis=1)
+
+
+def times_transposed(matrix: "Matrix", y: Array) -> Array:
+    """`matrix.T @ y` in a loop over time: y (n,), or (n, paths) (see `times`)."""
+    if y.ndim == 1 or isinstance(matrix, Diagonal):
+        return rmatvec(matrix, y)
+    return jnp.sum(matrix * y[:, None], axis=0)
+
+
 class Diagonal(eqx.Module):
     """diag(values), with any leading axes: stands for a square matrix where products should cost O(n), not O(n²)."""
 

@@ -52,7 +52,7 @@ def _mix(z: Array) -> Array:
     return z ^ (z >> np.uint64(31))
 
 
-def _pair(key: UInt32[Array, "4"]) -> tuple[Array, Array]:
+def _pair(key: UInt32[Array, "4 *keys"]) -> tuple[Array, Array]:
     words = key.astype(np.uint64)
     return (words[0] << HALF) | words[1], (words[2] << HALF) | words[3]
 
@@ -86,9 +86,13 @@ def _split(key: UInt32[Array, "4"], shape: tuple[int, ...]) -> UInt32[Array, "*s
 
 @_in_64_bits
 def _random_bits(key: UInt32[Array, "4"], width: int, shape: tuple[int, ...]) -> Array:
+    return _numbers(key, width, lax.iota(np.uint64, math.prod(shape)).reshape(shape))
+
+
+def _numbers(key: UInt32[Array, "4 *keys"], width: int, which: UInt64[Array, "..."]) -> Array:
     a, b = _pair(key)
     k = a | np.uint64(1)
-    counter = b + (a << np.uint64(63)) + lax.iota(np.uint64, math.prod(shape)).reshape(shape)
+    counter = b + (a << np.uint64(63)) + which
     x = y = counter * k
     z = y + k
     for step in (y, z, y):
@@ -133,3 +137,13 @@ def fast_key(seed: Any) -> Key[Array, ""]:
     if not fits or (whole.dtype == np.uint64 and not isinstance(seed, jax.Array) and whole >= 2**63):
         raise fail("seed", repr(seed), "be an integer of 64 bits", "Pass a whole number, as in pc.fast_key(0).")
     return jax.random.wrap_key_data(_seed(whole), impl=SQUARES)
+
+
+def random_words(keys: Key[Array, "*keys"], count: int, width: int) -> UInt32[Array, "count *keys"] | Array:
+    """`jax.random.bits(key, (count,))`, numbers of `width` bits, of one key or of several side by side."""
+    if keys.ndim == 0:
+        return jax.random.bits(keys, (count,), WIDTHS[width])
+    if jax.random.key_impl(keys) == jax.random.key_impl(fast_key(0)):
+        data = jnp.moveaxis(jax.random.key_data(keys), -1, 0)
+        return _in_64_bits(lambda data: _numbers(data, width, lax.iota(np.uint64, count)[:, None]))(data)
+    return jax.vmap(lambda key: random_words(key, count, width), out_axes=-1)(keys)

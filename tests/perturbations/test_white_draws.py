@@ -7,6 +7,7 @@ import pytest
 import scipy.stats
 
 import perfcontrol as pc
+from perfcontrol.perturbations.white_draws import chi_squares
 from tests.tools import assert_close, assert_mean_is, normal
 
 LAWS = ("gaussian", "sphere")
@@ -27,7 +28,8 @@ def _products(law, n, p, whole, adaptive=True, z=None):
         step = jax.tree.map(lambda leaf: leaf[0], draws.steps)
         ahead = draws.matvec_step(step, z)
         y = fixed + ahead if adaptive else fixed
-        return ahead, draws.rmatvec_along(step, y, z), y
+        back = jax.tree.map(lambda leaf: leaf[0], draws.steps_back(z[None]))
+        return ahead, draws.rmatvec_step(back, y), y
 
     return jax.jit(jax.vmap(one))(jax.random.split(jax.random.key(int(whole)), SAMPLES)), z
 
@@ -102,3 +104,13 @@ def test_sampled_gradients_have_the_law_of_those_of_whole_paths(law):
     ]
     for direction in np.random.default_rng(4).normal(size=(6, samples[0].shape[1])):
         assert scipy.stats.ks_2samp(*(some @ direction for some in samples)).pvalue > 1e-4
+
+
+def test_chi_square_numbers_follow_scipys_law():
+    degrees = (0, 1, 2, 3, 380)
+    rows = chi_squares(pc.fast_key(1), degrees, jnp.zeros(SAMPLES))
+    assert not np.any(rows[0])
+    for count, row in zip(degrees[1:], rows[1:], strict=True):
+        assert scipy.stats.kstest(np.asarray(row), scipy.stats.chi2(count).cdf).pvalue > 1e-3
+    correlations = np.corrcoef(np.asarray(rows[1:])) - np.eye(4)
+    assert np.abs(correlations).max() <= 5 / np.sqrt(SAMPLES)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from perfcontrol._checks import as_array, check_integer, check_key, check_shape, fail
-from perfcontrol._linalg import rmatvec
+from perfcontrol._linalg import times, times_transposed, transpose
 from perfcontrol._programs import program
 from perfcontrol.evaluate.paths import devices_for, over_paths
 from perfcontrol.evaluate.rollout import (
@@ -25,6 +25,7 @@ from perfcontrol.evaluate.rollout import (
     input_term,
     sample_along,
 )
+from perfcontrol.evaluate.time_loop import time_loop
 from perfcontrol.policy import feedforward_adjoint
 from perfcontrol.problem import PerformativeProblem, check_problem
 
@@ -63,19 +64,20 @@ def path_gradient(problem: PerformativeProblem, path: Path | Trajectories) -> Ar
     loop = problem.closed_loop(system.A, system.B)
     varying = loop.ndim == 3
 
-    def retreat(y: Array, step: Any) -> tuple[Array, tuple[Array, Array | None]]:
-        source_t, draw, loop_t, gain_t, z = step
-        reaction = path.draws.rmatvec_along(draw, y, z)
-        pulled = rmatvec(loop_t if varying else loop, y) + source_t
+    def retreat(fixed: Any, y: Array, step: Any) -> tuple[Array, tuple[Array, Array | None]]:
+        pulling, draws = fixed
+        source_t, draw, loop_t, gain_t = step
+        reaction = draws.rmatvec_step(draw, y)
+        pulled = (times_transposed(loop_t, y) if varying else times(pulling, y)) + source_t
         if acts_on_input:
-            return pulled + reaction[:n] - rmatvec(gain_t, reaction[n:]), (y, reaction[n:])
+            return pulled + reaction[:n] - times_transposed(gain_t, reaction[n:]), (y, reaction[n:])
         return pulled + reaction, (y, None)
 
-    met = None
-    if path.draws.remembers:
-        met = jnp.concatenate([path.x, path.u], axis=1)[:-1] if acts_on_input else path.x[:-1]
-    steps = (source[:-1], path.draws.steps, loop if varying else None, gains[:-1] if acts_on_input else None, met)
-    _, (following, on_input) = jax.lax.scan(retreat, source[-1], steps, reverse=True)
+    met = jnp.concatenate([path.x, path.u], axis=1)[:-1] if acts_on_input else path.x[:-1]
+    back = path.draws.steps_back(met)
+    steps = (source[:-1], back, loop if varying else None, gains[:-1] if acts_on_input else None)
+    fixed = None if varying else transpose(loop), path.draws
+    following, on_input = time_loop(retreat, fixed, source[-1], steps, path.draws.side_by_side, reverse=True)
     by_v = input_adjoint(system.B, following)
     if on_input is not None:
         by_v = by_v + on_input

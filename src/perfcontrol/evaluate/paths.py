@@ -13,7 +13,8 @@ from jaxtyping import Array, Key
 from perfcontrol._programs import known
 from perfcontrol.problem import PerformativeProblem
 
-LANES = 8  # paths worked on together: twice as fast as all at once
+LANES = 8  # paths that a device should have at least
+REGISTER = 32  # bytes of one number of all paths worked on together: with more the compiler leaves vectors alone
 CACHE = 2**24  # bytes of paths beyond which working on more of them together slows them down
 
 
@@ -32,8 +33,8 @@ def bytes_held(problem: PerformativeProblem, along: bool = False) -> int:
 
 
 def lanes(problem: PerformativeProblem, along: bool = False) -> int:
-    """How many paths a batched loop works on together: `LANES`, fewer where what they hold leaves the cache."""
-    return max(1, min(LANES, CACHE // bytes_held(problem, along)))
+    """How many paths a batched loop works on together: a register's, fewer where what they hold leaves the cache."""
+    return max(1, min(REGISTER // problem.dtype.itemsize, CACHE // bytes_held(problem, along)))
 
 
 def devices_for(samples: int, *given: Any) -> int:

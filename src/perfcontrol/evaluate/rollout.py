@@ -1,7 +1,7 @@
 """Simulation: closed-loop paths of a policy while another, or the same, is deployed.
 
 The time loop holds one matrix-vector product, one perturbation product and an addition; everything that does not
-depend on the state is computed in bulk around it.
+depend on the state is computed in bulk around it. Under vmap it takes a step of all paths at once (`time_loop`).
 """
 
 from typing import Any
@@ -12,10 +12,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from perfcontrol._checks import check_integer, check_key, fail
-from perfcontrol._linalg import Diagonal, Matrix, along_time, matvec
+from perfcontrol._linalg import Diagonal, Matrix, along_time, times
 from perfcontrol._memory import memory_size
 from perfcontrol._programs import program
 from perfcontrol.evaluate.paths import bytes_held, devices_for, over_paths
+from perfcontrol.evaluate.time_loop import time_loop
 from perfcontrol.perturbations import Draws, PathDraws
 from perfcontrol.policy import feedforward
 from perfcontrol.problem import PerformativeProblem, check_problem
@@ -111,17 +112,19 @@ def run_path(problem: PerformativeProblem, policy: Array, x0: Array, w: Array, d
     loop = problem.closed_loop(system.A, system.B)
     varying = loop.ndim == 3
 
-    def advance(x: Array, step: Any) -> tuple[Array, Array]:
+    def advance(fixed: Any, x: Array, step: Any) -> tuple[Array, Array]:
+        loop, draws = fixed
         offset_t, draw, loop_t, u_part = step
         z = x
         if acts_on_input:
             v_t, gain_t = u_part
-            z = jnp.concatenate([x, v_t - matvec(gain_t, x)])
-        following = matvec(loop_t if varying else loop, x) + draws.matvec_step(draw, z) + offset_t
+            z = jnp.concatenate([x, v_t - times(gain_t, x)])
+        following = times(loop_t if varying else loop, x) + draws.matvec_step(draw, z) + offset_t
         return following, following
 
     u_part = (v[:-1], along_time(gain, 2, problem.horizon + 1)[:-1]) if acts_on_input else None
-    _, states = jax.lax.scan(advance, x0, (offset, draws.steps, loop if varying else None, u_part))
+    steps = (offset, draws.steps, loop if varying else None, u_part)
+    states = time_loop(advance, (None if varying else loop, draws), x0, steps, draws.side_by_side)
     x = jnp.concatenate([x0[None], states])
     return Path(x, v - problem.feedback(x) if problem.has_gain else v, w, draws)
 

@@ -13,37 +13,37 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
-from perfcontrol._linalg import Matrix, matvec, rmatvec, transpose
+from perfcontrol._linalg import Matrix, times, times_transposed, transpose
 
 
 class PathDraws(eqx.Module):
     """One draw of Δ_0, ..., Δ_{T-1} for one path: each is applied once ahead, then at most once, transposed, back."""
 
-    remembers: ClassVar[bool] = False  # whether `rmatvec_along` looks at z
+    side_by_side: ClassVar[bool] = False  # whether all that products work with may have a last axis, of paths
 
     @property
     @abc.abstractmethod
     def steps(self) -> Any:
-        """What varies in time, a pytree with leading axis T."""
+        """What varies in time on the way ahead, a pytree with leading axis T."""
 
     @abc.abstractmethod
-    def matvec_step(self, step: Any, z: Float[Array, " p"]) -> Float[Array, " n"]:
+    def matvec_step(self, step: Any, z: Float[Array, "p *paths"]) -> Float[Array, "n *paths"]:
         """Δ_t z."""
 
     @abc.abstractmethod
-    def rmatvec_along(self, step: Any, y: Float[Array, " n"], z: Float[Array, " p"] | None) -> Float[Array, " p"]:
-        """Δ_tᵀ y of the Δ_t that was applied to z ahead; None where it does not remember."""
+    def steps_back(self, z: Float[Array, "T p"]) -> Any:
+        """What varies in time on the way back, after Δ_t was applied to z_t for every t."""
+
+    @abc.abstractmethod
+    def rmatvec_step(self, step: Any, y: Float[Array, "n *paths"]) -> Float[Array, "p *paths"]:
+        """Δ_tᵀ y, given a step of the way back."""
 
 
 class Draws(PathDraws):
     """One draw of Δ_0, ..., Δ_{T-1} as linear operators from R^p to R^n, p = n, or n+m for performative B."""
 
-    def rmatvec_along(self, step: Any, y: Array, z: Array | None) -> Array:
-        return self.rmatvec_step(step, y)
-
-    @abc.abstractmethod
-    def rmatvec_step(self, step: Any, y: Float[Array, " n"]) -> Float[Array, " p"]:
-        """Δ_tᵀ y."""
+    def steps_back(self, z: Array) -> Any:
+        return self.steps
 
     @abc.abstractmethod
     def dense(self) -> Float[Array, "T n p"]:
@@ -62,16 +62,17 @@ class DenseDraws(Draws):
     """Draws held as matrices."""
 
     matrices: Float[Array, "T n p"]
+    side_by_side: ClassVar[bool] = True
 
     @property
     def steps(self) -> Any:
         return self.matrices
 
     def matvec_step(self, step: Any, z: Array) -> Array:
-        return matvec(step, z)
+        return times(step, z)
 
     def rmatvec_step(self, step: Any, y: Array) -> Array:
-        return rmatvec(step, y)
+        return times_transposed(step, y)
 
     def dense(self) -> Array:
         return self.matrices

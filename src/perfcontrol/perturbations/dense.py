@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Key
 
 from perfcontrol._checks import as_array, check_instance, fail
+from perfcontrol._side_by_side import side_by_side
 from perfcontrol.perturbations import redrawn
 from perfcontrol.perturbations.base import (
     AbstractPerturbation,
@@ -40,8 +41,8 @@ class _White(eqx.Module):
     def __call__(self, key: Key[Array, ""]) -> Array:
         return self.many(key, 1)[0]
 
-    def many(self, key: Key[Array, ""], count: int) -> Array:
-        """`count` of them, independent."""
+    def many(self, key: Key[Array, "*keys"], count: int) -> Array:
+        """`count` of them, independent; for a scalar law also of several keys side by side."""
         shape = (count, *self.shape)
         if self.law is not None:
             return self.law.sample(key, count).reshape(shape)
@@ -174,8 +175,13 @@ class DensePerturbation(AbstractPerturbation):
         alike = self.law is None or self.law.covariance.ndim == 2  # at all times, as one drawn alone is taken to be
         if alike and horizon * math.prod(white.shape) * values.dtype.itemsize > redrawn.HELD:
             return redrawn.RedrawnDraws(key, jnp.arange(horizon), white, values, location)
-        matrices = values * white.many(key, horizon)
-        return DenseDraws(matrices if location is None else matrices + location)
+
+        def matrices(key: Key[Array, "*paths"], values: Array, location: Array | None) -> Array:
+            spread = values * white.many(key, horizon)
+            return spread if location is None else spread + location
+
+        draw = side_by_side(matrices) if self.kind in SCALAR_LAWS else matrices
+        return DenseDraws(draw(key, values, location))
 
     def sample_along(self, key: Key[Array, ""], M: Array, horizon: int) -> PathDraws:
         values = as_array("scale", evaluate_map(self.scale, M, "scale"))

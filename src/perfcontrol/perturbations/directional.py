@@ -1,14 +1,14 @@
 """Random multiples of fixed directions: Δ_t = mean(M)[t] + Σ_k scale(M)[t, k] ζ_{t,k} directions[k]."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Key
 
 from perfcontrol._checks import as_array, fail
-from perfcontrol._linalg import Matrix, as_dense, matvec, rmatvec
+from perfcontrol._linalg import Matrix, as_dense, times, times_transposed
 from perfcontrol.perturbations.base import AbstractPerturbation, CovarianceOperator, Draws, varying, zero_mean
 from perfcontrol.perturbations.dependence import as_scale, check_values
 from perfcontrol.perturbations.scalar_laws import SCALAR_LAWS
@@ -19,6 +19,7 @@ class _DirectionalDraws(Draws):
     mean: Array | None  # (n, p) or (T, n, p)
     coefficients: Array  # (T, k)
     directions: Array  # (k, n, p)
+    side_by_side: ClassVar[bool] = True
 
     @property
     def steps(self) -> Any:
@@ -27,14 +28,20 @@ class _DirectionalDraws(Draws):
     def matvec_step(self, step: Any, z: Array) -> Array:
         mean, coefficients = step
         mean = self.mean if mean is None else mean
-        product = coefficients @ matvec(self.directions, z)
-        return product if mean is None else product + matvec(mean, z)
+        products = times(self._stack, z).reshape(len(coefficients), -1, *z.shape[1:])
+        product = jnp.sum(coefficients[:, None] * products, axis=0)
+        return product if mean is None else product + times(mean, z)
 
     def rmatvec_step(self, step: Any, y: Array) -> Array:
         mean, coefficients = step
         mean = self.mean if mean is None else mean
-        product = coefficients @ rmatvec(self.directions, y)
-        return product if mean is None else product + rmatvec(mean, y)
+        product = times_transposed(self._stack, (coefficients[:, None] * y).reshape(-1, *y.shape[1:]))
+        return product if mean is None else product + times_transposed(mean, y)
+
+    @property
+    def _stack(self) -> Array:
+        """The directions one below the other, (k n, p)."""
+        return self.directions.reshape(-1, *self.directions.shape[2:])
 
     def dense(self) -> Array:
         matrices = jnp.einsum("tk,knp->tnp", self.coefficients, self.directions)

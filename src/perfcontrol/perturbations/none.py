@@ -1,6 +1,6 @@
 """No perturbation: the world does not react."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,6 +12,7 @@ from perfcontrol.perturbations.base import AbstractPerturbation, CovarianceOpera
 class _ZeroDraws(Draws):
     zeros: Array  # (T, 1): carries the horizon, and an axis that batched loops can reshape
     size: int = eqx.field(static=True)
+    side_by_side: ClassVar[bool] = True
 
     @property
     def steps(self) -> Any:

@@ -5,8 +5,11 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Key
 
+from perfcontrol.random_keys import random_words
 from perfcontrol.random_vectors import random_signs
 
 CUTOFF = 3.0  # the Gaussian is cut at this many of its own standard deviations before it is normalised
@@ -17,18 +20,25 @@ _MEAN_ABSOLUTE = 2 * (_DENSITY_AT_0 - _DENSITY_AT_CUTOFF) / _KEPT
 
 
 class ScalarLaw(NamedTuple):
-    """Sampler, sup |ζ| and E |ζ|."""
+    """Sampler, sup |ζ| and E |ζ|; several keys give draws side by side, along a last axis."""
 
-    sample: Callable[[Key[Array, ""], tuple[int, ...], Any], Array]
+    sample: Callable[[Key[Array, "*keys"], tuple[int, ...], Any], Array]
     bound: float
     mean_absolute: float
 
 
-def _uniform(key: Key[Array, ""], shape: tuple[int, ...], dtype: Any) -> Array:
-    return jax.random.uniform(key, shape, dtype, -math.sqrt(3), math.sqrt(3))
+def _uniform(key: Key[Array, "*keys"], shape: tuple[int, ...], dtype: Any) -> Array:
+    width, digits = jnp.finfo(dtype).bits, jnp.finfo(dtype).nmant
+    words = random_words(key, math.prod(shape), width).reshape(*shape, *key.shape)
+    # The highest bits of a word as the digits of a number in [1, 2).
+    one = np.ones((), dtype).view(words.dtype)
+    number = jax.lax.bitcast_convert_type((words >> np.array(width - digits, words.dtype)) | one, dtype)
+    return (number - 1) * np.array(2 * math.sqrt(3), dtype) - np.array(math.sqrt(3), dtype)
 
 
-def _truncated_gaussian(key: Key[Array, ""], shape: tuple[int, ...], dtype: Any) -> Array:
+def _truncated_gaussian(key: Key[Array, "*keys"], shape: tuple[int, ...], dtype: Any) -> Array:
+    if key.ndim:
+        return jax.vmap(lambda one: _truncated_gaussian(one, shape, dtype), out_axes=-1)(key)
     return jax.random.truncated_normal(key, -CUTOFF, CUTOFF, shape, dtype) / _NORMAL_SCALE
 
 

@@ -9,7 +9,7 @@ Every operator here costs O(L) or O(L²); nothing dense is built in the loops.
 """
 
 import math
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +27,7 @@ class StockDraws(Draws):
 
     deviation: Array  # (T, L): V - E V
     mean_diagonal: Array  # (T, L): E V - 1
+    side_by_side: ClassVar[bool] = True
 
     @property
     def steps(self) -> Any:
@@ -34,13 +35,13 @@ class StockDraws(Draws):
 
     def matvec_step(self, step: Any, z: Array) -> Array:
         deviation, mean = step
-        count = deviation.shape[-1]
+        count = len(deviation)
         shared = deviation * z[count:]
         return jnp.concatenate([mean * z[:count] + shared, mean * z[count:] + shared])
 
     def rmatvec_step(self, step: Any, y: Array) -> Array:
         deviation, mean = step
-        count = deviation.shape[-1]
+        count = len(deviation)
         return jnp.concatenate([mean * y[:count], mean * y[count:] + deviation * (y[:count] + y[count:])])
 
     def dense(self) -> Array:

@@ -1,13 +1,13 @@
 """Entries of two values, equally likely."""
 
+import math
 from typing import Any
 
-import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Key
 
 from perfcontrol._checks import check_nonnegative
+from perfcontrol.random_keys import random_words
 from perfcontrol.random_vectors.entrywise import Entrywise, paired
 
 
@@ -46,9 +46,10 @@ class Rademacher(Entrywise):
         return self.mean + scale * random_signs(key, (horizon, *scale.shape), scale.dtype)
 
 
-def random_signs(key: Key[Array, ""], shape: tuple[int, ...], dtype: Any) -> Array:
-    """Independent ±1, thirty-two from each random word."""
-    count = int(np.prod(shape, dtype=int))
-    words = jax.random.bits(key, ((count + 31) // 32,), jnp.uint32)
-    bits = (words[:, None] >> jnp.arange(32, dtype=jnp.uint32)) & 1
-    return (2 * bits.reshape(-1)[:count].astype(dtype) - 1).reshape(shape)
+def random_signs(key: Key[Array, "*keys"], shape: tuple[int, ...], dtype: Any) -> Array:
+    """Independent ±1, thirty-two from each random word, (*shape, *keys)."""
+    count = math.prod(shape)
+    words = random_words(key, -(-count // 32), 32)
+    bits = (words[:, None] >> jnp.arange(32, dtype=jnp.uint32).reshape(32, *[1] * key.ndim)) & 1
+    bits = bits.reshape(-1, *key.shape)[:count].reshape(*shape, *key.shape)
+    return 2 * bits.astype(dtype) - 1
