@@ -138,7 +138,7 @@ def test_a_stopped_sweep_keeps_its_points_and_solves_the_others(file, tmp_path, 
         solved.append(plan)
         return real(plan, progress)
 
-    monkeypatch.setattr("perfcontrol.cli.sweep.solved", counting)
+    monkeypatch.setattr("perfcontrol.cli.together.solved", counting)
     grid = ["--vary", "perturbation.scale.weight.0=0:0.4:2", "--vary", "solver=StablePoint,RRM"]
     with pytest.raises(Stopped):
         CliRunner().invoke(app, ["--no-cache", "sweep", str(file), *grid, "--out", str(tmp_path / "sweep")])
@@ -154,6 +154,33 @@ def test_a_stopped_sweep_keeps_its_points_and_solves_the_others(file, tmp_path, 
     np.testing.assert_allclose(grid.policy.sel(solver="RRM"), grid.policy.sel(solver="StablePoint"), atol=1e-9)
     assert float(abs(grid.policy[0, 0] - grid.policy[1, 0]).max()) > 1e-4
     assert load_dataset(tmp_path / "sweep" / "results.nc").cost.equals(grid.cost)
+
+
+def test_runs_that_differ_in_numbers_are_solved_together_each_as_alone_and_again_to_the_same_bits(
+    file, tmp_path, monkeypatch
+):
+    """Three points in blocks of two; one point is lost, as a kill between two points leaves it."""
+    monkeypatch.setattr("perfcontrol.cli.together.TOGETHER", 2)
+    monkeypatch.setattr("perfcontrol.cli.together.solved", None)  # nothing is solved alone
+    vary, folder = "perturbation.scale.weight.0", tmp_path / "sweep"
+    run("sweep", file, "--vary", f"{vary}=0,0.2,0.4", "--set", "solver.steps=30", "--out", folder)
+    before = {path.name: path.read_bytes() for path in (folder / "points").glob("*.npz")}
+    monkeypatch.undo()
+    for number, weight in enumerate((0, 0.2, 0.4)):
+        alone = said("solve", file, "--no-certify", "--set", "solver.steps=30", "--set", f"{vary}={weight}")
+        np.testing.assert_allclose(pc.load(folder / "points" / f"{number:06d}.npz").M, alone["policy"], rtol=1e-12)
+    monkeypatch.setattr("perfcontrol.cli.together.TOGETHER", 2)
+    for suffix in ("json", "npz"):
+        (folder / "points" / f"000001.{suffix}").unlink()
+    run("resume", folder)
+    for path in (folder / "points").glob("*.npz"):
+        np.testing.assert_array_equal(pc.load(path).history, _history(before[path.name], tmp_path))
+    assert len(before) == 3
+
+
+def _history(content, tmp_path):
+    (tmp_path / "before.npz").write_bytes(content)
+    return pc.load(tmp_path / "before.npz").history
 
 
 @pytest.mark.parametrize(

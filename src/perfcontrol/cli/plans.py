@@ -45,6 +45,11 @@ def plan_in(path: Path, settings: list[str] | None = None, seed: int | None = No
     return plan if seed is None else replace(plan, seed=seed)
 
 
+def recorded_every(solver: Any) -> int:
+    """Steps between two entries of the history of a solver's run."""
+    return max(1, -(-solver.max_steps // RECORDED))
+
+
 def solved(
     plan: "Plan", progress: Callable[[str, float], None], kinds: tuple[str, ...] = (), checkpoint: Path | None = None
 ) -> "Run":
@@ -56,7 +61,7 @@ def solved(
     from perfcontrol.theory import verdict_rows
 
     solver = plan.solver or StablePoint()
-    every = max(1, -(-solver.max_steps // RECORDED))
+    every = recorded_every(solver)
     key = jax.random.key(plan.seed)
     began = time.perf_counter()
     found = solve(

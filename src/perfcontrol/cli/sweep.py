@@ -9,8 +9,9 @@ import typer
 from rich.table import Table
 
 from perfcontrol.cli.app import app, configure_jax, console, in_words
-from perfcontrol.cli.plans import AsJson, File, Seed, Settings, cost_of, new_folder, solved
+from perfcontrol.cli.plans import AsJson, File, Seed, Settings, cost_of, new_folder
 from perfcontrol.cli.progress import stages
+from perfcontrol.cli.together import blocks
 
 if TYPE_CHECKING:
     from perfcontrol.files.run import Run
@@ -74,13 +75,17 @@ def fill(folder: Path, record: dict[str, Any], as_json: bool) -> None:
     document = changed(base_of(folder), record["settings"])
     points = points_of(record["axes"])
     done = {number for number, _ in finished(folder)}
+    read = (plan_at(document, point) for point in points)
+    plans = read if record["seed"] is None else (dataclasses.replace(plan, seed=record["seed"]) for plan in read)
     with stages(transient=True) as show:
-        for number, point in enumerate(points):
-            if number not in done:
-                show("points", number / len(points))
-                plan = plan_at(document, point)
-                plan = plan if record["seed"] is None else dataclasses.replace(plan, seed=record["seed"])
-                _keep_point(folder, number, point, solved(plan, lambda *_: None))
+        for block in blocks(plans, len(points)):
+            missing = set(block.places) - done
+            if missing:
+                for number, run in zip(block.places, block.solved(), strict=True):
+                    if number in missing:
+                        _keep_point(folder, number, points[number], run)
+                done |= missing
+                show("points", len(done) / len(points))
     dataset = read_sweep(folder, record)
     save_dataset(dataset, folder / "results.nc", {})
     write_record(folder, record | {"ended": now()})
