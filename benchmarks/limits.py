@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+import perfcontrol as pc
 from benchmarks.gradients import batch_gradients
 from benchmarks.measure import Row, compiled, median_time
 from benchmarks.problems import policy_of, problem_of
@@ -29,7 +30,7 @@ def scaling_rows() -> list[Row]:
         times = []
         for n, H, T, seeds in grid:
             problem = problem_of(n, H, T, "directional")
-            keys = jax.random.split(jax.random.key(0), seeds)
+            keys = jax.random.split(pc.fast_key(0), seeds)
             times.append(median_time(compiled(batch_gradients, problem, policy_of(problem), keys)[0]))
         value = exponent([case[position[axis]] for case in grid], times)
         rows.append((f"exponent in {axis}", "sampled gradient, directional, float64", times[-1], f"{value:.2f}"))
@@ -50,7 +51,7 @@ def machine_rows(best: float) -> list[Row]:
     source, target = np.ones(2**25, np.float32), np.zeros(2**25, np.float32)
     moved = median_time(lambda: np.copyto(target, source))
     numbers = 2**20
-    drawn = median_time(compiled(lambda key: jax.random.uniform(key, (numbers,), jnp.float32), jax.random.key(0))[0])
+    drawn = median_time(compiled(lambda key: jax.random.uniform(key, (numbers,), jnp.float32), pc.fast_key(0))[0])
     # A dense path draws a sign for every entry of 60 matrices, 32 from one word.
     share_drawn = f"{100 * 60 * 20 * 20 / 32 * drawn / numbers / best:.0f} % of a dense path's time is words of signs"
     work = 2 * 60 * (2 * 2 * 20 * 20)  # multiply-adds of two matrix products a step, forward and backward

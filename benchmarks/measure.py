@@ -8,6 +8,8 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from perfcontrol._programs import compiler_options
+
 Row = tuple[str, str, float, str]  # case, what, seconds, note
 
 
@@ -32,10 +34,11 @@ def side_by_side(calls: list[Callable[[], Any]], rounds: int = 15) -> list[float
 
 
 def compiled(function: Callable, *arguments: Any) -> tuple[Callable[[], Any], float]:
-    """A call of the compiled function on fixed arguments, and the seconds that compilation took."""
+    """A call of the function on fixed arguments, compiled as the package's programs are; seconds of compilation."""
     dynamic, static = eqx.partition(arguments, eqx.is_array)
     began = time.perf_counter()
-    program = jax.jit(lambda leaves: function(*eqx.combine(leaves, static))).lower(dynamic).compile()
+    program = jax.jit(lambda leaves: function(*eqx.combine(leaves, static)), compiler_options=compiler_options())
+    program = program.lower(dynamic).compile()
     return lambda: program(dynamic), time.perf_counter() - began
 
 
