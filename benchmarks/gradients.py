@@ -37,7 +37,7 @@ def gradients_on_all_cores(problem: pc.PerformativeProblem, M: jax.Array, keys: 
 
 
 def path_row(name: str, label: str, problem: pc.PerformativeProblem, M: jax.Array, printed: float) -> Row:
-    """Seconds of a step of a sampling method without projection: a path is drawn, simulated and differentiated."""
+    """Seconds of a step of a sampling method without projection: a path is drawn, simulated, differentiated."""
     call, build = compiled(lambda p, M, key: mean_path_gradient(p, M, M, key, 1), problem, M, pc.fast_key(2))
     took = median_time(call)
     note = f"{printed / took:.0f} (compiled in {build:.1f} s)"

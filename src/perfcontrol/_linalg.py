@@ -9,6 +9,9 @@ from jaxtyping import Array, Float
 
 from perfcontrol._programs import numerics
 
+FUSED = 32  # columns up to which products are multiply-and-sum, which XLA fuses: faster than a library call
+TERMS = 8
+
 
 def along_time(array: Any, inner_ndim: int, length: int) -> Any:
     """`array` (or `Diagonal`) with a leading time axis: broadcast if constant, as it is if it has one already."""
@@ -56,7 +59,7 @@ def matvec(matrix: "Matrix", vector: Array) -> Array:
     """`matrix @ vector` as multiply-and-sum, which XLA fuses: faster than a library call for small sizes."""
     if isinstance(matrix, Diagonal):
         return matrix.values * vector
-    if matrix.shape[-1] <= 32:
+    if matrix.shape[-1] <= FUSED:
         return jnp.sum(matrix * vector[..., None, :], axis=-1)
     return jnp.einsum("...ij,...j->...i", matrix, vector)
 
@@ -65,7 +68,7 @@ def rmatvec(matrix: "Matrix", vector: Array) -> Array:
     """`matrix.T @ vector` as multiply-and-sum (see `matvec`)."""
     if isinstance(matrix, Diagonal):
         return matrix.values * vector
-    if matrix.shape[-2] <= 32:
+    if matrix.shape[-2] <= FUSED:
         return jnp.sum(matrix * vector[..., :, None], axis=-2)
     return jnp.einsum("...ij,...i->...j", matrix, vector)
 
@@ -74,14 +77,28 @@ def times(matrix: "Matrix", z: Array) -> Array:
     """`matrix @ z` in a loop over time: z (p,), or (p, paths) beside a matrix (n, p, paths) or (n, p, 1)."""
     if z.ndim == 1 or isinstance(matrix, Diagonal):
         return matvec(matrix, z)
-    return jnp.sum(matrix * z, axis=1)
+    if _is_large(matrix) and matrix.shape[-1] == 1:
+        return matrix[..., 0] @ z
+    return _sum(matrix * z, 1)
 
 
 def times_transposed(matrix: "Matrix", y: Array) -> Array:
     """`matrix.T @ y` in a loop over time: y (n,), or (n, paths) (see `times`)."""
     if y.ndim == 1 or isinstance(matrix, Diagonal):
         return rmatvec(matrix, y)
-    return jnp.sum(matrix * y[:, None], axis=0)
+    if _is_large(matrix) and matrix.shape[-1] == 1:
+        return matrix[..., 0].T @ y
+    return _sum(matrix * y[:, None], 0)
+
+
+def _sum(products: Array, axis: int) -> Array:
+    """Over an axis, a few terms at a time: long sums beside one another XLA does not write out as vectors."""
+    parts = jnp.split(products, list(range(TERMS, products.shape[axis], TERMS)), axis)
+    return sum((jnp.sum(part, axis) for part in parts[1:]), jnp.sum(parts[0], axis))
+
+
+def _is_large(matrix: Array) -> bool:
+    return max(matrix.shape[:2]) > FUSED
 
 
 class Diagonal(eqx.Module):

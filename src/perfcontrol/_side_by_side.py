@@ -27,6 +27,10 @@ def side_by_side(function: Callable, *, carried: tuple[int, ...] = ()) -> Callab
         def wide(leaf: Any) -> Any:
             return jnp.broadcast_to(leaf, (*leaf.shape[:-1], copies))
 
+        if copies == 1:  # nothing to put beside it
+            single = jax.tree.map(lambda leaf, own: leaf[0] if own else leaf, arguments, tuple(batched))
+            outputs = jax.tree.map(lambda leaf: leaf[None], function(*single))
+            return outputs, jax.tree.map(lambda _: True, outputs)
         moved = jax.tree.map(last, arguments, tuple(batched))
         moved = [jax.tree.map(wide, tree) if number in carried else tree for number, tree in enumerate(moved)]
         outputs = jax.tree.map(lambda leaf: jnp.moveaxis(wide(leaf), -1, 0), function(*moved))

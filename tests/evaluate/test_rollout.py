@@ -104,8 +104,8 @@ def test_fewer_paths_are_worked_on_together_where_perturbations_are_large():
 
     assert lanes(dense(4, 10)) == 4  # numbers of eight bytes
     assert lanes(dense(4, 16_000)) == 4  # 1.5 MB of states, inputs and noise, 2 MB of matrices
-    assert lanes(dense(100, 100)) == 2  # 8 MB a path
-    assert lanes(dense(100, 400)) == 1
+    assert lanes(dense(4, 32_000)) == 2
+    assert lanes(dense(100, 10)) == 1  # matrices too large to lie side by side
 
 
 def test_paths_that_do_not_fit_into_the_memory_are_refused_before_work_starts(monkeypatch):

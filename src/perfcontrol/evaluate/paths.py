@@ -10,6 +10,7 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Key
 
+from perfcontrol._linalg import FUSED
 from perfcontrol._programs import known
 from perfcontrol.problem import PerformativeProblem
 
@@ -18,8 +19,8 @@ REGISTER = 32  # bytes of one number of all paths worked on together: with more 
 CACHE = 2**24  # bytes of paths beyond which working on more of them together slows them down
 
 
-def bytes_held(problem: PerformativeProblem, along: bool = False) -> int:
-    """Bytes of one path: its states, inputs, noise and perturbations."""
+def _drawn(problem: PerformativeProblem, along: bool) -> list[Any]:
+    """Shapes of what is drawn of the perturbations for one path."""
     policy = jax.ShapeDtypeStruct(problem.lifted_shape, problem.dtype)
     key = jax.eval_shape(lambda: jax.random.key(0))
     draws = eqx.filter_eval_shape(
@@ -28,12 +29,23 @@ def bytes_held(problem: PerformativeProblem, along: bool = False) -> int:
         key,
         policy,
     )
+    return jax.tree.leaves(draws)
+
+
+def bytes_held(problem: PerformativeProblem, along: bool = False) -> int:
+    """Bytes of one path: its states, inputs, noise and perturbations."""
     numbers = (problem.horizon + 1) * (2 * problem.state_size + problem.input_size)
-    return numbers * policy.dtype.itemsize + sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(draws))
+    drawn = sum(leaf.size * leaf.dtype.itemsize for leaf in _drawn(problem, along))
+    return numbers * problem.dtype.itemsize + drawn
 
 
 def lanes(problem: PerformativeProblem, along: bool = False) -> int:
-    """How many paths a batched loop works on together: a register's, fewer where what they hold leaves the cache."""
+    """How many paths a batched loop works on together: a register's, fewer where what they hold leaves the cache.
+
+    Paths that have large matrices of their own are better worked on one by one.
+    """
+    if any(leaf.ndim == 3 and max(leaf.shape[1:]) > FUSED for leaf in _drawn(problem, along)):
+        return 1
     return max(1, min(REGISTER // problem.dtype.itemsize, CACHE // bytes_held(problem, along)))
 
 
