@@ -6,8 +6,8 @@ import pytest
 
 import perfcontrol as pc
 from perfcontrol.evaluate.cost_to_go import world_of
-from perfcontrol.response.projected import Projected
-from perfcontrol.response.quadratic import Quadratic, factors, quadratic, stationary
+from perfcontrol.response.projected import Projected, ProjectedByFactors
+from perfcontrol.response.quadratic import Factors, Quadratic, factors, quadratic, stationary
 from perfcontrol.response.respond import _method, _shape_of_cost
 from tests.tools import DOUBLE, assert_close, normal
 
@@ -33,7 +33,8 @@ VARYING = pc.Sequence([[0.1, 0.2], [0.3, -0.1], [0.2, 0.4]])
         ({}, "Separable"),
         ({"noise": VARYING}, "Affine"),
         ({"feasible_set": pc.RowSum(0.5)}, "Affine"),
-        ({"feasible_set": pc.FrobeniusBall(0.5)}, "Projected"),
+        ({"feasible_set": pc.FrobeniusBall(0.5)}, "ProjectedByFactors"),
+        ({"feasible_set": pc.FrobeniusBall(0.5), "noise": VARYING}, "Projected"),
     ],
 )
 def test_the_cheapest_exact_method_serves(changes, name):
@@ -41,6 +42,33 @@ def test_the_cheapest_exact_method_serves(changes, name):
     world = world_of(p, p.initial_policy())
     assert type(_method(p, world, _shape_of_cost(p, world))).__name__ == name
     assert stationary(world) == ("noise" not in changes)
+
+
+@pytest.mark.parametrize("exponent, steps_end", [(1.0, True), (8.0, False)])
+@pytest.mark.parametrize("definite", [True, False])
+@pytest.mark.parametrize("name", ["ball", "box", "active ball", "active box"])
+@pytest.mark.skipif(not DOUBLE, reason="conditions that single precision does not tell apart")
+def test_gradient_steps_end_at_the_minimiser_or_hand_over_to_newton(name, exponent, steps_end, definite):
+    """A quadratic whose minimiser, of norm 1, lies inside the set, or outside of it."""
+    size = 0.7 if name.startswith("active") else 9.0
+    feasible_set = pc.FrobeniusBall(size) if name.endswith("ball") else pc.Box(-size / 3, size / 3)
+    vectors, _ = np.linalg.qr(normal(7, 6, 6))
+    G, inside = (vectors * np.logspace(0, -exponent, 6)) @ vectors.T, np.asarray(normal(8, 3, 2, 2))
+    inside = inside / np.linalg.norm(inside)
+    linear = -2 * (G @ inside.reshape(6, 2)).reshape(3, 2, 2)
+    form = Factors(linear, G, np.zeros((6, 6)), np.eye(2), np.zeros(2))
+    newton = Projected(feasible_set, Quadratic(form.linear, np.asarray(0.5), form.matrix))
+    asked = []
+    method = ProjectedByFactors(
+        feasible_set, form, np.asarray(0.5), np.asarray(definite), lambda: asked.append(None) or newton
+    )
+    M, unique = method.minimise(np.zeros_like(linear))
+    reference, _ = newton.minimise(np.zeros_like(linear))
+    assert_close(M, reference, 1e-7 if exponent > 1 else 1e-12)
+    if not name.startswith("active"):
+        assert_close(M, inside, 1e-7 if exponent > 1 else 1e-12)
+        assert bool(asked) == (not steps_end or not definite)
+    assert bool(unique)
 
 
 def test_factors_and_matrix_are_the_same_quadratic():

@@ -3,6 +3,7 @@
 Newton works on the natural residual θ - Proj(θ - η g) through the derivative of the projection.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -10,11 +11,12 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from perfcontrol._linalg import frobenius, solve
-from perfcontrol._programs import numerics, program, while_loop
-from perfcontrol.response.quadratic import Operator, Quadratic
+from perfcontrol._programs import cond, numerics, program, while_loop
+from perfcontrol.response.quadratic import Factors, Operator, Quadratic
 from perfcontrol.sets import AbstractSet, Unconstrained
 
-ACCELERATED_STEPS = 400
+ACCELERATED_STEPS = 400  # before the first Newton step
+PATIENCE = 50 * ACCELERATED_STEPS  # where Newton does not help, or is dear
 NEWTON_STEPS = 30
 KRYLOV = 30
 
@@ -80,6 +82,41 @@ class Projected:
         return -solve(system, self.step * slope @ reaction)
 
 
+class ProjectedByFactors:
+    """The quadratic given by its factors on a convex set: gradient steps, which need no Hessian, end in most cases.
+
+    Args:
+        feasible_set: the set. factors: of the quadratic. step: 1/‖𝐇‖. definite: whether 𝐇 is, beyond rounding.
+        dense: the method that serves where they do not end, or 𝐇 is singular, and for derivatives.
+    """
+
+    def __init__(self, feasible_set: AbstractSet, factors: Factors, step: Any, definite: Any, dense: Callable[[], Any]):
+        self.feasible_set, self.factors, self.step = feasible_set, factors, step
+        self.definite, self.dense = definite, dense
+
+    def minimise(self, start: Any) -> tuple[Any, Any]:
+        """The minimiser, and whether it is the only one."""
+        M, ended = _gradient_descent(self.feasible_set, self.factors, self.step, start)
+        return cond(ended & self.definite, lambda: (M, self.definite), lambda: self.dense().minimise(M))
+
+    def newton(self, M: Any) -> Operator:
+        """gradient -> the Newton step from near the minimiser M."""
+        return self.dense().newton(M)
+
+    def jacobian(self, M: Any, reaction: Any) -> Any:
+        """Φ', (p, p), given 𝐄 = ∂_2 g, (p, p)."""
+        return self.dense().jacobian(M, reaction)
+
+
+@program
+def _gradient_descent(feasible_set: AbstractSet, factors: Factors, step: Any, start: Any) -> tuple[Array, Array]:
+    """Where accelerated steps lead, and whether they have ended there."""
+    form = Quadratic(factors.linear, step, None, factors.gradient)
+    eps = float(jnp.finfo(start.dtype).eps)
+    M = _accelerated(feasible_set, form, feasible_set.project(start), 40 * eps, PATIENCE)
+    return M, frobenius(_natural_gap(feasible_set, form, M)) <= 100 * eps * _scale(form, M)
+
+
 def _newton_by_products(feasible_set: AbstractSet, form: Quadratic, M: Array, gradient: Array) -> Array:
     """The same Newton step by GMRES, where the Hessian is not held."""
     project, step = feasible_set.project, form.step
@@ -111,21 +148,25 @@ def _minimise(feasible_set: AbstractSet, form: Quadratic, start: Array) -> tuple
     eps = float(jnp.finfo(start.dtype).eps)
 
     def unsolved(carry: Any) -> Array:
-        M, gap, *_, tolerance = carry
+        M, gap, _, tolerance, _ = carry
         return (gap > 4 * eps * _scale(form, M)) & (tolerance > eps)
 
     def approach(carry: Any) -> Any:
         # Newton may stall on the wrong face, from where no step of its own helps: then gradient steps again.
-        M, *_, tolerance = carry
-        M, gap, system = _newton_steps(
-            feasible_set, form, _accelerated(feasible_set, form, M, tolerance, ACCELERATED_STEPS)
-        )
-        return M, gap, system, 1e-3 * tolerance
+        M, *_, tolerance, limit = carry
+        M, gap, system = _newton_steps(feasible_set, form, _accelerated(feasible_set, form, M, tolerance, limit))
+        return M, gap, system, 1e-3 * tolerance, jnp.asarray(PATIENCE)
 
     far = jnp.asarray(jnp.inf, start.dtype)
     eye = jnp.eye(start.size, dtype=start.dtype)
-    first = (feasible_set.project(start), far, eye, jnp.asarray(1e-5, start.dtype))
-    M, _, system, _ = jax.lax.while_loop(unsolved, approach, first)
+    first = (
+        feasible_set.project(start),
+        far,
+        eye,
+        jnp.asarray(1e-5, start.dtype),
+        jnp.asarray(ACCELERATED_STEPS),
+    )
+    M, _, system, *_ = jax.lax.while_loop(unsolved, approach, first)
     # On the active face the Hessian must be definite: the Jacobian has full rank.
     values = jnp.linalg.eigvalsh(system @ system.T)
     return M, values[0] > (M.size * eps * 100) ** 2 * jnp.maximum(values[-1], 1)
@@ -134,7 +175,7 @@ def _minimise(feasible_set: AbstractSet, form: Quadratic, start: Array) -> tuple
 def _approach_by_gradients(feasible_set: AbstractSet, form: Quadratic, start: Array) -> Array:
     """Gradient steps alone, where the Hessian is not held."""
     eps = float(jnp.finfo(start.dtype).eps)
-    return _accelerated(feasible_set, form, feasible_set.project(start), 40 * eps, 50 * ACCELERATED_STEPS)
+    return _accelerated(feasible_set, form, feasible_set.project(start), 40 * eps, PATIENCE)
 
 
 def _natural_gap(feasible_set: AbstractSet, form: Quadratic, M: Array) -> Array:
@@ -170,7 +211,7 @@ def _scale(form: Quadratic, M: Array) -> Array:
     return frobenius(M) + frobenius(form.step * form.linear) + jnp.finfo(M.dtype).tiny
 
 
-def _accelerated(feasible_set: AbstractSet, form: Quadratic, start: Array, tolerance: Any, limit: int) -> Array:
+def _accelerated(feasible_set: AbstractSet, form: Quadratic, start: Array, tolerance: Any, limit: Any) -> Array:
     """Projected gradient steps with momentum, restarted when it points uphill."""
 
     def accelerate(carry: Any) -> Any:

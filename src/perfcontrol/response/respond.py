@@ -25,13 +25,13 @@ from perfcontrol.problem import PerformativeProblem, check_problem
 from perfcontrol.response import quadratic as quadratics
 from perfcontrol.response.affine import Affine, AffineByProducts
 from perfcontrol.response.estimate import SampleAverage, estimate_response, is_exact
-from perfcontrol.response.projected import Projected, gradient_steps, nearest
+from perfcontrol.response.projected import Projected, ProjectedByFactors, gradient_steps, nearest
 from perfcontrol.response.quadratic import Factors, Operator, factors, quadratic, quadratic_by_passes, stationary
 from perfcontrol.response.sampled import Sampled, approach, minimise, sampled_jacobian, sampled_residual
 from perfcontrol.response.separable import Separable
 from perfcontrol.sets import FullStructure, Unconstrained
 
-Method = Affine | AffineByProducts | Projected | Separable
+Method = Affine | AffineByProducts | Projected | ProjectedByFactors | Separable
 
 
 class Response(NamedTuple):
@@ -60,7 +60,8 @@ def _on_host(problem: PerformativeProblem, deployed: Any, *others: Any) -> bool:
 
 def _shape_of_cost(problem: PerformativeProblem, world: World) -> Any:
     """What the methods need to know of the quadratic; finite unless the world overflows."""
-    if _free(problem) and stationary(world):
+    factored = stationary(world) and isinstance(problem.structure, FullStructure)
+    if factored and (_free(problem) or (_held(problem) and not problem.feasible_set.affine)):
         return factors(problem, world)
     return quadratic(problem, world) if _held(problem) else quadratic_by_passes(problem, world)
 
@@ -68,7 +69,16 @@ def _shape_of_cost(problem: PerformativeProblem, world: World) -> Any:
 def _method(problem: PerformativeProblem, world: World, form: Any) -> Method:
     """The cheapest method that is exact for this kind of problem; known from types and shapes alone."""
     if isinstance(form, Factors):
-        return _separable_method(problem, world, form)
+        free = _separable_method(problem, world, form)
+        if _free(problem):
+            return free
+        return ProjectedByFactors(
+            problem.feasible_set,
+            form,
+            free.step,
+            free.regular,
+            lambda: Projected(problem.feasible_set, quadratic(problem, world)),
+        )
     if problem.feasible_set.affine:
         return (Affine if _held(problem) else AffineByProducts)(problem.feasible_set, form)
     return Projected(problem.feasible_set, form)
