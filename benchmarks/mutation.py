@@ -35,6 +35,7 @@ TESTS = {  # the tests of a room, those that fail soonest first
     "theory": ["tests/theory"],
 }
 PATIENCE = 1800  # seconds of a core after which a fault counts as noticed: it has made something endless
+MANY = 50  # of so many samples, steps or rows one more makes no difference
 SWAPS: dict[type, type] = {
     ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult,
     ast.Lt: ast.GtE, ast.GtE: ast.Lt, ast.Gt: ast.LtE, ast.LtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
@@ -52,13 +53,14 @@ class Fault(NamedTuple):
 
 
 def _code(tree: ast.AST) -> Iterator[ast.AST]:
-    """The nodes that compute: no annotations, no messages of errors, no limits named in capitals.
+    """The nodes that compute: no annotations, no messages of errors, no limits.
 
-    A limit (how near, how long, how much at once) may have another value and be as right.
+    A limit (how near, how long, how much at once; a number in capitals) may have another value and be as right.
     """
     skipped: set[int] = set()
     for node in ast.walk(tree):
-        limit = isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name) and node.targets[0].id.isupper()
+        limit = isinstance(node, ast.Assign) and ast.unparse(node.targets[0]).isupper()
+        limit |= isinstance(node, ast.keyword) and node.arg in ("strict", "static", "batch_size")
         if limit or isinstance(node, ast.Raise | ast.Import | ast.ImportFrom | ast.JoinedStr):
             skipped |= {id(inner) for inner in ast.walk(node)}
         for name in ("annotation", "returns", "decorator_list"):
@@ -77,7 +79,7 @@ def _mutable(node: ast.AST) -> str | None:
         return f"{type(node.ops[0]).__name__} -> {SWAPS[type(node.ops[0])].__name__}"
     if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub) and not isinstance(node.operand, ast.Constant):
         return "sign dropped"
-    if isinstance(node, ast.Constant) and isinstance(node.value, bool | int | float):
+    if isinstance(node, ast.Constant) and isinstance(node.value, bool | int | float) and node.value < MANY:
         return f"{node.value} -> {_changed(node.value)}"
     return None
 
