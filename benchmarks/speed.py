@@ -9,6 +9,7 @@ import jax
 
 import perfcontrol as pc
 from benchmarks.evaluation import exact_rows, stable_rows, sweep_rows
+from benchmarks.goals import goals_table
 from benchmarks.gradients import gradient_rows, lane_rows, sampled_rows, seed_rows
 from benchmarks.limits import machine_rows, scaling_rows
 from benchmarks.measure import Row, as_markdown
@@ -16,11 +17,11 @@ from benchmarks.problems import SHAPES, policy_of, problem_of
 from perfcontrol.experiments.batches import in_single_precision
 
 LAWS = {"uniform": "uniform entries", "gaussian": "normal entries", "sphere": "on a sphere"}
-SMALL = "(20, 1, 60)"
+SMALL, LARGE = "(20, 1, 60)", "(100, 5, 100)"
 
 
 def table(quick: bool) -> str:
-    """The whole table as Markdown."""
+    """The goals and all rows, as Markdown."""
     rows: list[Row] = []
     printed: dict[str, float] = {}
     for name, shape in SHAPES.items():
@@ -49,4 +50,4 @@ def table(quick: bool) -> str:
     rows += scaling_rows()
     best = min(t for case, what, t, _ in rows if case == f"dense, signs {SMALL}" and what.endswith("float32, one core"))
     rows += machine_rows(best)
-    return as_markdown(rows)
+    return goals_table(rows, SMALL, LARGE) + "\n\n" + as_markdown(rows)

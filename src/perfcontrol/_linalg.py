@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from perfcontrol._programs import numerics
 
 FUSED = 32  # columns up to which products are multiply-and-sum, which XLA fuses: faster than a library call
-TERMS = 8
+TERMS = 8  # of sums side by side that XLA still writes out as vectors
 
 
 def along_time(array: Any, inner_ndim: int, length: int) -> Any:
@@ -92,7 +92,7 @@ def times_transposed(matrix: "Matrix", y: Array) -> Array:
 
 
 def _sum(products: Array, axis: int) -> Array:
-    """Over an axis, a few terms at a time: long sums beside one another XLA does not write out as vectors."""
+    """Over an axis, `TERMS` at a time."""
     parts = jnp.split(products, list(range(TERMS, products.shape[axis], TERMS)), axis)
     return sum((jnp.sum(part, axis) for part in parts[1:]), jnp.sum(parts[0], axis))
 

@@ -217,8 +217,8 @@ class PerformativeProblem(Printed, eqx.Module):
     @property
     def dtype(self) -> Any:
         """The floating-point type of the computation."""
-        leaves = jax.tree.leaves(eqx.filter(self, eqx.is_inexact_array))
-        return jnp.result_type(*leaves)
+        types = {leaf.dtype for leaf in jax.tree.leaves(self) if eqx.is_inexact_array(leaf)}
+        return types.pop() if len(types) == 1 else jnp.result_type(*types)
 
     def lift(self, M: Any) -> Array:
         """The full policy (memory, m, n) of free parameters M."""
