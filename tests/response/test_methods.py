@@ -6,9 +6,9 @@ import pytest
 
 import perfcontrol as pc
 from perfcontrol.evaluate.cost_to_go import world_of
+from perfcontrol.response.methods import method_of, shape_of_cost
 from perfcontrol.response.projected import Projected, ProjectedByFactors
 from perfcontrol.response.quadratic import Factors, Quadratic, factors, quadratic, stationary
-from perfcontrol.response.respond import _method, _shape_of_cost
 from tests.tools import DOUBLE, assert_close, normal
 
 
@@ -40,7 +40,7 @@ VARYING = pc.Sequence([[0.1, 0.2], [0.3, -0.1], [0.2, 0.4]])
 def test_the_cheapest_exact_method_serves(changes, name):
     p = problem(**changes)
     world = world_of(p, p.initial_policy())
-    assert type(_method(p, world, _shape_of_cost(p, world))).__name__ == name
+    assert type(method_of(p, world, shape_of_cost(p, world))).__name__ == name
     assert stationary(world) == ("noise" not in changes)
 
 

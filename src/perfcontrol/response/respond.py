@@ -1,12 +1,11 @@
 """The best response Φ(M') = argmin over the feasible set of C_T(·; M'), exactly, for quadratic stage costs.
 
 C_T(·; M') is a convex quadratic in the free parameters. One engine serves best responses, repeated minimisation,
-stable points and theory; by the kind of problem it is `Separable`, `Affine` or `Projected`. Iterations run on frozen
+stable points and theory; `methods` says which method serves which problem. Iterations run on frozen
 numbers; the derivative of Φ comes from one Newton step at the minimiser (implicit function theorem), never from
 differentiating a loop.
 """
 
-import math
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -22,16 +21,12 @@ from perfcontrol.evaluate.loop import require_moments
 from perfcontrol.evaluate.reaction import reaction_jacobian
 from perfcontrol.evaluate.rollout import check_pair
 from perfcontrol.problem import PerformativeProblem, check_problem
-from perfcontrol.response import quadratic as quadratics
-from perfcontrol.response.affine import Affine, AffineByProducts
+from perfcontrol.response.affine import AffineByProducts
 from perfcontrol.response.estimate import SampleAverage, estimate_response, is_exact
-from perfcontrol.response.projected import Projected, ProjectedByFactors, gradient_steps, nearest
-from perfcontrol.response.quadratic import Factors, Operator, factors, quadratic, quadratic_by_passes, stationary
+from perfcontrol.response.methods import is_free, is_held, method_of, shape_of_cost, step_length
+from perfcontrol.response.projected import gradient_steps, nearest
+from perfcontrol.response.quadratic import Operator, stationary
 from perfcontrol.response.sampled import Sampled, approach, minimise, sampled_jacobian, sampled_residual
-from perfcontrol.response.separable import Separable
-from perfcontrol.sets import FullStructure, Unconstrained
-
-Method = Affine | AffineByProducts | Projected | ProjectedByFactors | Separable
 
 
 class Response(NamedTuple):
@@ -42,76 +37,11 @@ class Response(NamedTuple):
     unique: Any
 
 
-def _held(problem: PerformativeProblem) -> bool:
-    """Whether the Hessian is held as a matrix."""
-    return math.prod(problem.policy_shape) <= quadratics.DENSE_LIMIT
-
-
-def _free(problem: PerformativeProblem) -> bool:
-    return isinstance(problem.feasible_set, Unconstrained) and isinstance(problem.structure, FullStructure)
-
-
 def _on_host(problem: PerformativeProblem, deployed: Any, *others: Any) -> bool:
     """Whether the method works on the host, step by step: where the Hessian is held, or its factors are regular."""
     if not known(problem, deployed, *others):
         return False
-    return _held(problem) or (_free(problem) and stationary(jax.eval_shape(world_of, problem, deployed)))
-
-
-def _shape_of_cost(problem: PerformativeProblem, world: World) -> Any:
-    """What the methods need to know of the quadratic; finite unless the world overflows."""
-    factored = stationary(world) and isinstance(problem.structure, FullStructure)
-    if factored and (_free(problem) or (_held(problem) and not problem.feasible_set.affine)):
-        return factors(problem, world)
-    return quadratic(problem, world) if _held(problem) else quadratic_by_passes(problem, world)
-
-
-def _method(problem: PerformativeProblem, world: World, form: Any) -> Method:
-    """The cheapest method that is exact for this kind of problem; known from types and shapes alone."""
-    if isinstance(form, Factors):
-        free = _separable_method(problem, world, form)
-        if _free(problem):
-            return free
-        return ProjectedByFactors(
-            problem.feasible_set,
-            form,
-            free.step,
-            free.regular,
-            lambda: Projected(problem.feasible_set, quadratic(problem, world)),
-        )
-    if problem.feasible_set.affine:
-        return (Affine if _held(problem) else AffineByProducts)(problem.feasible_set, form)
-    return Projected(problem.feasible_set, form)
-
-
-class _ByProducts(NamedTuple):
-    """`AffineByProducts` in one program."""
-
-    problem: PerformativeProblem
-    world: World
-
-    def solve(self, gradient: Any) -> Any:
-        return _solve_by_products(self.problem, self.world, gradient)
-
-    def minimise(self, start: Any) -> tuple[Any, Any]:
-        return _minimise_by_products(self.problem, self.world, start)
-
-
-def _by_products(problem: PerformativeProblem, world: World) -> AffineByProducts:
-    return AffineByProducts(problem.feasible_set, quadratic_by_passes(problem, world))
-
-
-_solve_by_products = program(lambda problem, world, gradient: _by_products(problem, world).solve(gradient))
-_minimise_by_products = program(lambda problem, world, start: _by_products(problem, world).minimise(start))
-
-
-def _separable_method(problem: PerformativeProblem, world: World, form: Factors) -> Separable:
-    def dense() -> Affine | _ByProducts:
-        if _held(problem):
-            return Affine(problem.feasible_set, quadratic(problem, world))
-        return _ByProducts(problem, world)
-
-    return Separable(form, dense)
+    return is_held(problem) or (is_free(problem) and stationary(jax.eval_shape(world_of, problem, deployed)))
 
 
 def _sound(form: Any) -> Any:
@@ -122,15 +52,15 @@ def _sound(form: Any) -> Any:
 
 def _respond(problem: PerformativeProblem, deployed: Any, start: Any, inner_steps: int | None) -> Response:
     world = world_of(problem, deployed)
-    form = _shape_of_cost(problem, world)
+    form = shape_of_cost(problem, world)
     xp, _ = numerics(form, start)
     sound = _sound(form)
     if known(sound) and not sound:
         return Response(xp.full_like(start, xp.nan), xp.asarray(False))
     if inner_steps is None:
-        M, unique = _method(problem, world, form).minimise(start)
+        M, unique = method_of(problem, world, form).minimise(start)
     else:
-        step = _step(problem, world, form)
+        step = step_length(problem, world, form)
         M, unique = gradient_steps(problem.feasible_set, form.gradient, step, start, inner_steps), xp.asarray(True)
     # Pseudo-inverses turn an overflow into finite nonsense: no number at all is the honest answer.
     return Response(xp.where(sound, M, xp.nan), unique)
@@ -159,7 +89,7 @@ def respond(problem: PerformativeProblem, deployed: Any, start: Any = None, inne
 
 def response_hessian(problem: PerformativeProblem, world: World) -> Any:
     """𝐇 = ∂_1 g in a given world, (p, p); where it is held."""
-    return _shape_of_cost(problem, world).matrix
+    return shape_of_cost(problem, world).matrix
 
 
 def response_jacobian(problem: PerformativeProblem, deployed: Any, response: Any) -> Any:
@@ -167,7 +97,7 @@ def response_jacobian(problem: PerformativeProblem, deployed: Any, response: Any
     if isinstance(problem, Sampled):
         return sampled_jacobian(problem, on_host(deployed), on_host(response))
     world = world_of(problem, deployed)
-    method = _method(problem, world, _shape_of_cost(problem, world))
+    method = method_of(problem, world, shape_of_cost(problem, world))
     assert not isinstance(method, AffineByProducts)
     return method.jacobian(response, reaction_jacobian(problem, response, deployed))
 
@@ -178,7 +108,7 @@ def response_pushforward(problem: PerformativeProblem, deployed: Array, response
         slope = sampled_jacobian(problem, deployed, response)
         return lambda V: (slope @ V.reshape(-1)).reshape(V.shape)
     world = world_of(problem, deployed)
-    newton = _method(problem, world, _shape_of_cost(problem, world)).newton(response)
+    newton = method_of(problem, world, shape_of_cost(problem, world)).newton(response)
     base, pushforward = jax.linearize(lambda policy: exact_gradient(problem, response, policy), deployed)
     # A Newton step is affine in the gradient to first order at a solution; its value there is zero up to rounding.
     _, step_forward = jax.linearize(newton, base)
@@ -191,14 +121,9 @@ def differentiable_response(problem: PerformativeProblem, deployed: Array) -> Ar
     world = world_of(problem, deployed)
     M = respond(problem, deployed).M
     frozen = jax.lax.stop_gradient(world)
-    newton = _method(problem, frozen, _shape_of_cost(problem, frozen)).newton(M)
+    newton = method_of(problem, frozen, shape_of_cost(problem, frozen)).newton(M)
     corrected = newton(weigh(problem, world, M)[1])
     return M + (corrected - jax.lax.stop_gradient(corrected))
-
-
-def _step(problem: PerformativeProblem, world: World, form: Any) -> Any:
-    """η = 1/‖Hessian‖."""
-    return _separable_method(problem, world, form).step if isinstance(form, Factors) else form.step
 
 
 def natural_residual(problem: PerformativeProblem, M: Any, deployed: Any, gradient: Any = None) -> Any:
@@ -207,13 +132,13 @@ def natural_residual(problem: PerformativeProblem, M: Any, deployed: Any, gradie
     g is the gradient given, or ∇_1 C_T(M; deployed) by a pass over time of its own.
     """
     world = world_of(problem, deployed)
-    form = _shape_of_cost(problem, world)
+    form = shape_of_cost(problem, world)
     xp, _ = numerics(form, M)
     at_M = weigh(problem, world, M)[1] if gradient is None else gradient
     sound = _sound((form, at_M))
     if known(sound) and not sound:
         return xp.asarray(xp.inf, at_M.dtype)
-    step = _step(problem, world, form)
+    step = step_length(problem, world, form)
     moved = frobenius(M - nearest(problem.feasible_set, M - step * at_M))
     scale = frobenius(M) + frobenius(step * form.linear)
     return xp.where(sound, moved / xp.where(scale > 0, scale, 1), xp.inf)
@@ -221,11 +146,11 @@ def natural_residual(problem: PerformativeProblem, M: Any, deployed: Any, gradie
 
 def _step_at(problem: PerformativeProblem, deployed: Any) -> Any:
     world = world_of(problem, deployed)
-    form = _shape_of_cost(problem, world)
+    form = shape_of_cost(problem, world)
     sound = _sound(form)
     if known(sound) and not sound:
         return np.asarray(np.nan, problem.dtype)
-    return _step(problem, world, form)
+    return step_length(problem, world, form)
 
 
 _residual_in_one_program = program(natural_residual)

@@ -28,7 +28,7 @@ class Separable:
         self.G = Definite(G)
         S_values, S_vectors = xp.linalg.eigh(Sigma)
         self.regular = self.G.regular & (S_values[0] > n * eps * S_values[-1])
-        largest = 2 * (self.G.largest * S_values[-1] + xp.trace(G_mean) * (w @ w))
+        largest = 2 * (self.G.largest * S_values[-1] + xp.linalg.norm(G_mean) * (w @ w))
         self.step = 1 / xp.maximum(largest, tiny)
         self.inverse_root = (S_vectors / xp.sqrt(xp.where(S_values > 0, S_values, 1))) @ S_vectors.T
         self.centred = known(w) and not xp.any(w)
