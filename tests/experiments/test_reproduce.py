@@ -70,7 +70,7 @@ def test_runs_equal_single_solves_with_the_same_key(done: tuple[Path, Outcome]) 
 
 def test_stopped_runs_repeat_the_last_policy() -> None:
     problems = problems_of(SETTINGS, "rows")
-    lab = laboratory(SETTINGS, problems, xarray.Dataset())
+    lab = laboratory(SETTINGS, problems, xarray.Dataset)
     case, steps = np.array([UNSTABLE]), 300
     solution = lab.run(case, 5, np.arange(3)[None], constant_step(10.0), steps, lambda share: None)
     assert set(names_of(solution).flat) <= {"diverged", "nonfinite"}
@@ -135,7 +135,7 @@ def test_without_the_simplex_its_claim_and_its_curve_are_left_out(done: tuple[Pa
 def test_quoted_thresholds_are_those_of_the_theory() -> None:
     problems = problems_of(SETTINGS, "rows")
     exact = exact_stage(problems, SETTINGS, silent)
-    quoted = divergence_stage.mean_square_thresholds(SETTINGS, exact)
+    quoted = divergence_stage.mean_square_thresholds(SETTINGS, lambda: exact)
     np.testing.assert_allclose(divergence_stage.computed_thresholds(SETTINGS, exact), quoted, rtol=0.15)
     assert np.all(np.diff(quoted[[1, 2, 0]]) > 0)
 

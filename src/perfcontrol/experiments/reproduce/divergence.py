@@ -1,6 +1,7 @@
 """The unstable regime again: what cures its divergence, what does not, and where it begins."""
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ MEAN_SQUARE_THRESHOLDS = {"ascending": 0.0236, "random": 0.00898, "descending": 
 
 
 def cure_stage(
-    lab: Laboratory, bounded: Laboratory | None, settings: ReproduceSettings, progress: Progress
+    lab: Laboratory, bounded: list[Laboratory], settings: ReproduceSettings, progress: Progress
 ) -> xarray.Dataset:
     """The unstable regime again: with a diminishing step, with a smaller one, and on the bounded simplex."""
     cases = UNSTABLE + np.arange(len(ORDERS))
@@ -31,8 +32,8 @@ def cure_stage(
         "diminishing": (lab, diminishing_step(step), settings.cure_steps),
         "smaller": (lab, constant_step(SMALL_STEP * step), settings.steps),
     }
-    if bounded is not None:
-        plans["simplex"] = (bounded, constant_step(step), settings.steps)
+    for place in bounded:
+        plans["simplex"] = (place, constant_step(step), settings.steps)
     data: dict[str, Any] = {}
     total, before = sum(steps for *_, steps in plans.values()), 0
     for name, (place, rule, steps) in plans.items():
@@ -73,7 +74,7 @@ def sweep_stage(lab: Laboratory, settings: ReproduceSettings, progress: Progress
     )
 
 
-def mean_square_thresholds(settings: ReproduceSettings, exact: xarray.Dataset) -> np.ndarray:
+def mean_square_thresholds(settings: ReproduceSettings, exact: Callable[[], xarray.Dataset]) -> np.ndarray:
     """Largest constant step (on the stage average) that is stable in mean square, unstable regime, by order.
 
     Quoted where the market is the default one, else computed (some ten seconds).
@@ -82,7 +83,7 @@ def mean_square_thresholds(settings: ReproduceSettings, exact: xarray.Dataset) -
     default = ReproduceSettings()
     if all(getattr(settings, name) == getattr(default, name) for name in market):
         return np.asarray([MEAN_SQUARE_THRESHOLDS[order] for order in ORDERS])
-    return computed_thresholds(settings, exact)
+    return computed_thresholds(settings, exact())
 
 
 def computed_thresholds(settings: ReproduceSettings, exact: xarray.Dataset) -> np.ndarray:

@@ -30,7 +30,7 @@ class Laboratory(NamedTuple):
     """
 
     problems: PerformativeProblem  # stacked, on the host
-    exact: xarray.Dataset
+    exact: Callable[[], xarray.Dataset]  # asked for once runs have ended: both are worked on at the same time
     starts: np.ndarray  # (seeds, 1, stocks, stocks)
     root: Array
 
@@ -56,11 +56,13 @@ class Laboratory(NamedTuple):
     def errors(self, cases: Any, solution: Solution) -> np.ndarray:
         """‖M_n - M^PS‖²_F, with the axes of the runs and one of steps."""
         policies = np.asarray(solution.history)[..., 0, :, :]
-        stable = self.exact["M"].values.reshape(-1, 1, 1, *policies.shape[-2:])[cases]
+        stable = self.exact()["M"].values.reshape(-1, 1, 1, *policies.shape[-2:])[cases]
         return np.sum((policies - stable) ** 2, axis=(-2, -1))
 
 
-def laboratory(settings: ReproduceSettings, problems: list[PerformativeProblem], exact: xarray.Dataset) -> Laboratory:
+def laboratory(
+    settings: ReproduceSettings, problems: list[PerformativeProblem], exact: Callable[[], xarray.Dataset]
+) -> Laboratory:
     """The laboratory of one feasible set."""
     stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *map(in_single_precision, problems))
     seeds = max(settings.seeds, settings.cure_seeds, settings.sweep_seeds)
@@ -119,7 +121,7 @@ def run_stage(
         ),
         "result": (dims, names_of(solution).reshape(shape), {"long_name": "how the run ended"}),
         "steps_taken": (dims, taken.reshape(shape), {"long_name": "iterations until the run ended"}),
-        "stable_policy": (("regime", "order", "row", "column"), lab.exact["M"].values),
-        "stable_cost": (("regime", "order"), lab.exact["cost"].values),
+        "stable_policy": (("regime", "order", "row", "column"), lab.exact()["M"].values),
+        "stable_cost": (("regime", "order"), lab.exact()["cost"].values),
     }
     return xarray.Dataset(data, coords={**CASES, "seed": np.arange(seeds), "step": np.arange(length)})

@@ -59,22 +59,23 @@ def reproduce(out: Path, settings: ReproduceSettings, progress: Progress | None 
         return repeated_minimisation(problems, exact_stage(problems, settings, progress), settings)
 
     with ThreadPoolExecutor() as pool:
-        waiting = [
+        exact = pool.submit(stages.run, "exact", exact_and_repeated)
+        bounded = [
             pool.submit(stages.run, "exact_simplex", lambda: exact_stage(bounded_problems, settings, silent))
             for _ in range(settings.simplex)
         ]
-        exact = stages.run("exact", exact_and_repeated)
-        floors = pool.submit(stages.run, "floors", lambda: floors_stage(settings, exact))
-        optimum = stages.run("optimum", lambda: optimum_stage(problems, progress))
-        exact_bounded = waiting[0].result() if waiting else None
-        lab = laboratory(settings, problems, exact)
-        bounded = None if exact_bounded is None else laboratory(settings, bounded_problems, exact_bounded)
+        optimal = pool.submit(stages.run, "optimum", lambda: optimum_stage(problems, progress))
+        floors = pool.submit(stages.run, "floors", lambda: floors_stage(settings, exact.result()))
+        lab = laboratory(settings, problems, exact.result)
+        bounded_labs = [laboratory(settings, bounded_problems, stable.result) for stable in bounded]
         runs = stages.run("runs", lambda: run_stage(lab, problems, settings, progress))
+        optimum = optimal.result()
         figures = pool.submit(stages.timed, "figures", lambda: _figures().draw_runs(out, runs, optimum))
-        cure = stages.run("cure", lambda: cure_stage(lab, bounded, settings, progress))
+        cure = stages.run("cure", lambda: cure_stage(lab, bounded_labs, settings, progress))
         sweep = stages.run("sweep", lambda: sweep_stage(lab, settings, progress))
         cure, files = cure.merge(floors.result()), figures.result()
-    claims = stages.timed("claims", lambda: judge(exact, exact_bounded, optimum, runs, cure, sweep, settings))
+    exact_bounded = bounded[0].result() if bounded else None
+    claims = stages.timed("claims", lambda: judge(exact.result(), exact_bounded, optimum, runs, cure, sweep, settings))
     results.save_json([claim.as_dict() for claim in claims], out / "claims.json")
     results.save_text(as_markdown(claims, settings.model_dump()), out / "claims.md")
     files += stages.timed("figures", lambda: _figures().draw_cure(out, cure, sweep, settings))
