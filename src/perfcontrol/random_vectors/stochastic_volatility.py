@@ -125,7 +125,7 @@ class StochasticVolatility(AbstractRandomVector):
             return _growth(volatility, self.rate, self.log_sensitivity.shape[0], jnp)
 
         # The numbers of jax.random.normal. Stock by stock, since XLA would otherwise work day by day on vectors of a
-        # few stocks, which takes five times as long.
+        # few stocks, which takes over twice as long.
         dtype = self.log_sensitivity.dtype
         above = np.nextafter(dtype.type(-1), dtype.type(0))
         uniform = jax.random.uniform(key, (horizon, *self._ones.shape), dtype, above, 1)
