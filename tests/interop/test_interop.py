@@ -185,3 +185,20 @@ REFUSED = {
 @pytest.mark.parametrize("case", REFUSED.values(), ids=REFUSED.keys())
 def test_interop_is_refused_with_a_four_part_error(case):
     assert_refused(*case)
+
+
+def test_feedback_with_a_positive_sign_closes_the_loop():
+    A, B = np.array([[1.0, 0.1], [0.0, 1.0]]), np.array([[0.0], [0.1]])
+    names = {"states": ["level", "flow"], "outputs": ["level", "flow"], "inputs": ["valve"]}
+    plant = control.ss(A, B, np.eye(2), np.zeros((2, 1)), 0.1, **names)
+    system, x0 = pc.interop.from_control(plant), np.array([1.0, 0.0])
+    problem = pc.PerformativeProblem(
+        system=system, horizon=30, memory=2, gain=pc.design_gain(system, Q=np.eye(2), R=np.eye(1)),
+        cost=pc.QuadraticCost(np.eye(2), np.eye(1)), initial_state=pc.Constant(x0), noise=pc.Constant(np.zeros(2)),
+    )  # fmt: skip
+    M = 0.1 * np.ones((2, 1, 2))
+    loop = control.feedback(plant, pc.interop.to_control(problem, M, noise="recovered"), sign=1)
+    start = np.zeros(loop.nstates)
+    start[:2] = start[2:4] = x0
+    response = control.forced_response(loop, 0.1 * np.arange(31), np.zeros((1, 31)), start)
+    assert_close(response.outputs.T, pc.simulate(problem, M, key=jax.random.key(0)).x[0], 1e-12)
