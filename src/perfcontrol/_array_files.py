@@ -24,8 +24,9 @@ class UnreadableError(Exception):
 def write_arrays(path: Path, header: dict[str, Any], tree: Any) -> None:
     """Write the header, whose `format` says whose file it is, and the arrays of a tree."""
     text = np.frombuffer(json.dumps(header, allow_nan=False).encode(), np.uint8)
+    arrays: dict[str, Any] = {HEADER: text, **named(tree)}
     with written_whole(path) as temporary, temporary.open("wb") as file:
-        np.savez(file, allow_pickle=False, **{HEADER: text}, **named(tree))
+        np.savez(file, **arrays)  # no keyword more: NumPy 2.0 takes each for an array
 
 
 def read_arrays(path: Path, form: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
