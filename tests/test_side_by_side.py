@@ -49,6 +49,25 @@ def test_derivatives_in_both_modes_are_those_of_the_plain_loop():
         assert_close(differentiate(total(_looped))(0.7), differentiate(total(_plain))(0.7), 1e-12)
 
 
+@pytest.mark.parametrize("copies", [3, 6])  # the second is the length of the loop: axes exchanged would not be noticed
+@pytest.mark.parametrize("axis", [0, 1])
+def test_derivatives_taken_after_the_copies_were_traced_are_those_of_the_plain_loop(copies, axis):
+    x, steps, weight = normal(1, 4), normal(2, 6, 4), normal(3, copies, 6, 4)
+
+    def total(loop):
+        def traced(a):
+            one = lambda index: loop(a, x + index, steps) if axis == 0 else loop(a, x, steps * (1 + index))  # noqa: E731
+            return jnp.sum(weight * jax.lax.map(one, jnp.arange(copies, dtype=a.dtype), batch_size=copies) ** 2)
+
+        return traced
+
+    a = jnp.asarray(0.7)
+    for differentiate in (jax.grad, jax.jacfwd, lambda f: jax.jacfwd(jax.grad(f)), lambda f: jax.jit(jax.grad(f))):
+        assert_close(differentiate(total(_looped))(a), differentiate(total(_plain))(a), 1e-12)
+    many = jnp.asarray([0.7, 0.2])
+    assert_close(jax.vmap(jax.grad(total(_looped)))(many), jax.vmap(jax.grad(total(_plain)))(many), 1e-12)
+
+
 def test_what_all_copies_share_has_one_last_entry():
     seen = []
 

@@ -38,5 +38,14 @@ def side_by_side(function: Callable, *, carried: tuple[int, ...] = ()) -> Callab
 
     # Derivatives are the function's own: JAX has none of custom_vmap in reverse.
     differentiable = jax.custom_jvp(lambda *arguments: together(*arguments))
-    differentiable.defjvp(lambda primals, tangents: jax.jvp(function, primals, tangents))
+    differentiable.defjvp(lambda primals, tangents: jax.tree.map(_copies_first, jax.jvp(function, primals, tangents)))
     return differentiable
+
+
+def _copies_first(leaf: jax.Array) -> jax.Array:
+    """The same numbers, under vmap with the copies along the first axis, where `copies_last` leaves them.
+
+    JAX takes it that a function and its derivative, each under vmap, agree on that axis, and does not look; `scan`
+    would leave its copies behind time. What reshapes an array moves its copies to the front.
+    """
+    return jax.lax.reshape(jax.lax.reshape(leaf, (1, *leaf.shape)), leaf.shape)
