@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
-from perfcontrol._linalg import Matrix, times, times_transposed, transpose
+from perfcontrol._linalg import Matrix, matvec, rmatvec, times, times_transposed, transpose
 
 
 class PathDraws(eqx.Module):
@@ -76,6 +76,23 @@ class DenseDraws(Draws):
 
     def dense(self) -> Array:
         return self.matrices
+
+
+class MetDraws(Draws):
+    """Draws whose matrix at a time is made whenever it is met."""
+
+    @abc.abstractmethod
+    def matrix(self, step: Any) -> Float[Array, "n p"]:
+        """Δ_t."""
+
+    def matvec_step(self, step: Any, z: Array) -> Array:
+        return matvec(self.matrix(step), z)
+
+    def rmatvec_step(self, step: Any, y: Array) -> Array:
+        return rmatvec(self.matrix(step), y)
+
+    def dense(self) -> Array:
+        return jax.vmap(self.matrix)(self.steps)
 
 
 class CovarianceOperator(eqx.Module):

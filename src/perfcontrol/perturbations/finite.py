@@ -7,13 +7,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Key
 
 from perfcontrol._checks import as_array, fail, is_concrete
-from perfcontrol._linalg import matvec, rmatvec
-from perfcontrol.perturbations.base import AbstractPerturbation, CovarianceOperator, Draws
+from perfcontrol.perturbations.base import AbstractPerturbation, CovarianceOperator, Draws, MetDraws
 from perfcontrol.perturbations.dependence import check_values
 from perfcontrol.policy_maps import AbstractPolicyMap, ConstantMap, as_policy_map, evaluate_map
 
 
-class _FiniteDraws(Draws):
+class _FiniteDraws(MetDraws):
     indices: Array  # (T,); past the end where the probabilities are invalid, which reads as NaN
     values: Array  # (k, n, p) or (T, k, n, p)
 
@@ -21,18 +20,9 @@ class _FiniteDraws(Draws):
     def steps(self) -> Any:
         return self.indices, self.values if self.values.ndim == 4 else None
 
-    def _matrix(self, step: Any) -> Array:
+    def matrix(self, step: Any) -> Array:
         index, values = step
         return jnp.take(self.values if values is None else values, index, axis=0, mode="fill", fill_value=jnp.nan)
-
-    def matvec_step(self, step: Any, z: Array) -> Array:
-        return matvec(self._matrix(step), z)
-
-    def rmatvec_step(self, step: Any, y: Array) -> Array:
-        return rmatvec(self._matrix(step), y)
-
-    def dense(self) -> Array:
-        return jax.vmap(self._matrix)(self.steps)
 
 
 class _FiniteCovariance(CovarianceOperator):

@@ -6,13 +6,12 @@ from typing import Any
 import jax
 from jaxtyping import Array, Float, Int, Key
 
-from perfcontrol._linalg import matvec, rmatvec
-from perfcontrol.perturbations.base import Draws, varying
+from perfcontrol.perturbations.base import MetDraws, varying
 
 HELD = 2**27  # bytes of a path's matrices up to which they are held: drawing them twice costs JAX's own keys time
 
 
-class RedrawnDraws(Draws):
+class RedrawnDraws(MetDraws):
     """Θ_t + S_t ∘ Z_t, where Z_t = white(fold_in(key, t)) is the same whenever it is asked for.
 
     white: key -> Z, (n, p). scale: S, to be broadcast to (n, p), and location: Θ, None for zero; both with a leading
@@ -29,17 +28,8 @@ class RedrawnDraws(Draws):
     def steps(self) -> Any:
         return self.times, varying(self.scale), varying(self.location)
 
-    def _matrix(self, step: Any) -> Array:
+    def matrix(self, step: Any) -> Array:
         t, scale, location = step
         matrix = (self.scale if scale is None else scale) * self.white(jax.random.fold_in(self.key, t))
         location = self.location if location is None else location
         return matrix if location is None else matrix + location
-
-    def matvec_step(self, step: Any, z: Array) -> Array:
-        return matvec(self._matrix(step), z)
-
-    def rmatvec_step(self, step: Any, y: Array) -> Array:
-        return rmatvec(self._matrix(step), y)
-
-    def dense(self) -> Array:
-        return jax.vmap(self._matrix)(self.steps)

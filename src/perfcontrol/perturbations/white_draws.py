@@ -68,7 +68,6 @@ def _norm(z: Array) -> Array:
 
 def normal_draws(key: Key[Array, ""], location: Array | None, scale: Float[Array, " T"], n: int, p: int) -> WhiteDraws:
     """Independent normal entries of standard deviation s_t about Θ_t."""
-
     both = jax.random.normal(key, (len(scale), n + p), scale.dtype)
     return WhiteDraws(location, scale, both[:, :n], both[:, n:], None)
 
