@@ -64,20 +64,22 @@ def cost_to_go(problem: PerformativeProblem, reacting: Array) -> CostToGo:
     varying, on_input = F.ndim == 3, state_part is not None
     spread_steps, backward = (spread.steps, None) if varying or on_input else spread.backward(F)
 
-    def retreat(Lambda: Array, step: Any) -> tuple[Array, Array]:
-        F_t, stage_t, spread_t, state_part_t = step
-        if backward is not None:
-            moved = backward(spread_t, Lambda)
-        else:
-            reaction = spread.adjoint_step(spread_t, Lambda)
-            moved = congruence(F_t if varying else F, Lambda)
-            moved = moved + (congruence(state_part_t, reaction) if on_input else reaction)
-        return (on_x if stage_t is None else stage_t) + moved, Lambda
+    stages = symmetrise(on_x)
 
-    last = symmetrise(on_x if on_x.ndim == 2 else on_x[-1])
-    stages = on_x[:-1] if on_x.ndim == 3 else None
-    steps = (F if varying else None, stages, spread_steps, state_part)
-    first, Lambda = jax.lax.scan(retreat, last, steps, reverse=True)
+    def retreat(ahead: Array, step: Any) -> tuple[Array, Array]:
+        """What lies ahead of t + 1 becomes what lies ahead of t; Λ_{t+1} comes out."""
+        F_t, stage, spread_t, state_part_t = step
+        Lambda = (stages if stage is None else stage) + ahead
+        if backward is not None:
+            return backward(spread_t, Lambda), Lambda
+        reaction = spread.adjoint_step(spread_t, Lambda)
+        moved = congruence(F_t if varying else F, Lambda)
+        return moved + (congruence(state_part_t, reaction) if on_input else reaction), Lambda
+
+    # The carry is what lies ahead, not Λ: nothing that is stored is overwritten, and XLA needs no copy.
+    steps = (F if varying else None, stages[1:] if stages.ndim == 3 else None, spread_steps, state_part)
+    ahead, Lambda = jax.lax.scan(retreat, jnp.zeros((n, n), on_x.dtype), steps, problem.horizon, reverse=True)
+    first = (stages if stages.ndim == 2 else stages[0]) + ahead
     if state_part is not None:
         reaction = spread.adjoint(Lambda)[:, n:, :]
         last_stage = ((0, 1), (0, 0), (0, 0))  # nothing reacts after it

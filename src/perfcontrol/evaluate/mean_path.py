@@ -27,7 +27,7 @@ def mean_path(problem: PerformativeProblem, world: CostToGo, v: Array, w: Array,
     cost = problem.cost
     assert isinstance(cost, QuadraticCost)
     push = input_term(world.B, v) + w
-    moved = matvec(world.Lambda, push)
+    moved = _each(world.Lambda, push)
     source, by_input_stage, constant = jnp.zeros((T + 1, n), v.dtype), 0, 0
     if cost.has_targets:
         linear, constant = cost.linear_terms(T)
@@ -35,31 +35,37 @@ def mean_path(problem: PerformativeProblem, world: CostToGo, v: Array, w: Array,
         source = linear[:, :n] - problem.feedback_adjoint(by_input_stage)
     if world.N is not None:
         source = source + (v @ world.N if world.N.ndim == 2 else rmatvec(world.N, v))
-    varying = world.F.ndim == 3
-    F = world.F if varying else None
 
-    def retreat(p: Array, step: Any) -> tuple[Array, Array]:
-        F_t, source_t, moved_t = step
-        return source_t + rmatvec(F_t if varying else world.F, moved_t + p), p
+    def turned(tree: Any) -> Any:
+        return jax.tree.map(lambda leaf: jnp.flip(leaf, 0), tree)
 
-    p0, p_next = jax.lax.scan(retreat, source[-1], (F, source[:-1], moved), reverse=True)
+    # One loop goes both ways, forward with the mean state and backward with p: neither needs the other.
+    varying = (world.F, turned(world.F)) if world.F.ndim == 3 else None
 
-    def advance(mu: Array, step: Any) -> tuple[Array, Array]:
-        F_t, push_t = step
-        following = matvec(F_t if varying else world.F, mu) + push_t
-        return following, following
+    def go(carry: tuple[Array, Array], step: Any) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        (mu, p), (F_t, push_t, (source_t, moved_t)) = carry, step
+        F, F_back = (world.F, world.F) if F_t is None else F_t
+        mu = matvec(F, mu) + push_t
+        return (mu, source_t + rmatvec(F_back, moved_t + p)), (mu, p)
 
-    _, mu = jax.lax.scan(advance, x0, (F, push))
+    steps = varying, push, turned((source[:-1], moved))
+    (_, p0), (mu, p_next) = jax.lax.scan(go, (x0, source[-1]), steps)
+    p_next = turned(p_next)
     # x' Λ x + 2 p' x is what lies ahead: each push adds its own to it, and by_v is what it adds at the margin.
     total = x0 @ (world.first @ x0 + 2 * p0) + jnp.sum(push * (moved + 2 * p_next)) + jnp.sum(constant)
     weighed = v @ world.R if world.R.ndim == 2 else matvec(world.R, v)
     total = total + jnp.sum(v * (weighed + 2 * by_input_stage))
-    margin = input_adjoint(world.B, matvec(world.Lambda, mu) + p_next)
+    margin = input_adjoint(world.B, _each(world.Lambda, mu) + p_next)
     by_v = weighed + by_input_stage + jnp.pad(margin, ((0, 1), (0, 0)))
     if world.N is not None:
         states = jnp.concatenate([x0[None], mu])
         by_v = by_v + (states @ world.N.T if world.N.ndim == 2 else matvec(world.N, states))
     return total, 2 * by_v
+
+
+def _each(matrices: Array, vectors: Array) -> Array:
+    """matrix_t @ vector_t for every t, by a library call: outside of loops faster than multiply-and-sum."""
+    return (matrices @ vectors[..., None])[..., 0]
 
 
 def sustained_form(world: World, memory: int) -> Array:

@@ -57,8 +57,9 @@ class _White(eqx.Module):
 class _WhiteCovariance(CovarianceOperator):
     """Entries uncorrelated: E[(S∘Z) X (S∘Z)ᵀ] = diag_i(Σ_a S_ia² X_aa)."""
 
-    variances: Array  # (n, p) or (T, n, p)
+    variances: Array  # (n, p), or (1, 1) for all entries alike; or (T, ...)
     times: Array  # (T, 0): carries the horizon
+    shape: tuple[int, int] = eqx.field(static=True)  # n, p
 
     @property
     def steps(self) -> Any:
@@ -68,10 +69,12 @@ class _WhiteCovariance(CovarianceOperator):
         return self.variances if step[1] is None else step[1]
 
     def apply_step(self, step: Any, X: Array) -> Array:
-        return jnp.diag(self._at(step) @ jnp.diagonal(X))
+        rows = jnp.sum(self._at(step) * jnp.diagonal(X), axis=1)
+        return jnp.diag(jnp.broadcast_to(rows, self.shape[0]))
 
     def adjoint_step(self, step: Any, X: Array) -> Array:
-        return jnp.diag(jnp.diagonal(X) @ self._at(step))
+        columns = jnp.sum(self._at(step) * jnp.diagonal(X)[:, None], axis=0)
+        return jnp.diag(jnp.broadcast_to(columns, self.shape[1]))
 
 
 class _ColouredCovariance(CovarianceOperator):
@@ -207,8 +210,8 @@ class DensePerturbation(AbstractPerturbation):
     def covariance(self, M: Array, horizon: int) -> CovarianceOperator:
         values, shape = self._values(M), self._shape(M)
         if self.law is None:
-            squares = jnp.broadcast_to(values**2, (*values.shape[:-2], *shape))
-            return _WhiteCovariance(squares, jnp.zeros((horizon, 0), values.dtype))
+            squares = (values[None, None] if values.ndim == 0 else values) ** 2
+            return _WhiteCovariance(squares, jnp.zeros((horizon, 0), values.dtype), shape)
         scales = self.scales(M, horizon)
         return _ColouredCovariance(scales, self._vector(M).covariance.reshape(*shape, *shape))
 
