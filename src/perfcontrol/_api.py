@@ -33,6 +33,7 @@ from perfcontrol.evaluate import (
 )
 from perfcontrol.files import Run, load, save
 from perfcontrol.identification import Decision, Fit, Logs, ReactionTest, fit, test_reaction
+from perfcontrol.kernel import use_kernel
 from perfcontrol.perturbations import (
     AbstractPerturbation,
     DensePerturbation,
@@ -253,6 +254,7 @@ __all__ = [
     "strong_stability",
     "test_reaction",
     "theorem_step_size",
+    "use_kernel",
 ]
 
 explain_calls("perfcontrol", globals(), __all__)

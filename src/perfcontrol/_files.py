@@ -44,6 +44,13 @@ def _flush(path: Path, mode: int) -> None:
         os.close(handle)
 
 
+def cache_folder() -> Path:
+    """Where compiled programs are kept: $PERFCONTROL_CACHE, or a folder of the user's own."""
+    named = os.environ.get("PERFCONTROL_CACHE")
+    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return Path(named) if named else base / "perfcontrol"
+
+
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
     """Errors of the operating system inside are about `path`; a full disk says of itself not even which file."""

@@ -12,6 +12,7 @@ draws fewer than 2⁶³ numbers. The same holds for `split`. Keys that are no su
 every generator: of N keys that draw L numbers each, two meet with a probability of about N² L / 2¹²⁷.
 """
 
+import functools
 import math
 from collections.abc import Callable
 from importlib import import_module
@@ -139,11 +140,21 @@ def fast_key(seed: Any) -> Key[Array, ""]:
     return jax.random.wrap_key_data(_seed(whole), impl=SQUARES)
 
 
+def is_fast(keys: Key[Array, "*keys"]) -> bool:
+    """Whether the keys are those of `fast_key`."""
+    return jax.random.key_impl(keys) == _kind()
+
+
+@functools.cache
+def _kind() -> Any:
+    return jax.random.key_impl(jax.random.wrap_key_data(np.zeros(4, np.uint32), impl=SQUARES))
+
+
 def random_words(keys: Key[Array, "*keys"], count: int, width: int) -> UInt32[Array, "count *keys"] | Array:
     """`jax.random.bits(key, (count,))`, numbers of `width` bits, of one key or of several side by side."""
     if keys.ndim == 0:
         return jax.random.bits(keys, (count,), WIDTHS[width])
-    if jax.random.key_impl(keys) == jax.random.key_impl(fast_key(0)):
+    if is_fast(keys):
         data = jnp.moveaxis(jax.random.key_data(keys), -1, 0)
         return _in_64_bits(lambda data: _numbers(data, width, lax.iota(np.uint64, count)[:, None]))(data)
     return jax.vmap(lambda key: random_words(key, count, width), out_axes=-1)(keys)

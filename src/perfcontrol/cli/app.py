@@ -4,7 +4,6 @@ import contextlib
 import errno
 import os
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import typer
@@ -100,19 +99,14 @@ def _why(error: OSError) -> str:
     return known or f"{error.strerror or error}. Check the path and the disk."
 
 
-def cache_folder() -> Path:
-    """Where compiled programs are kept."""
-    named = os.environ.get("PERFCONTROL_CACHE")
-    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return Path(named) if named else base / "perfcontrol"
-
-
 def configure_jax() -> None:
     """Double precision, one host device a core, compiled programs kept on disk."""
     import jax
 
     from perfcontrol._cache import cache
     from perfcontrol._checks import InputError
+    from perfcontrol._files import cache_folder
+    from perfcontrol.kernel import use_kernel
 
     jax.config.update("jax_enable_x64", True)
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -124,6 +118,8 @@ def configure_jax() -> None:
             cache(cache_folder())
         except InputError as error:
             errors.print(f"note: compiled programs are not kept: {error}", markup=False, highlight=False)
+    if os.environ.get("PERFCONTROL_KERNEL", "0") not in ("", "0"):
+        use_kernel()
 
 
 def shown(value: Any) -> str:

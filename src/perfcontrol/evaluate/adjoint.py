@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, Key
 from perfcontrol._checks import as_array, check_integer, check_key, check_shape, fail
 from perfcontrol._linalg import times, times_transposed, transpose
 from perfcontrol._programs import program
+from perfcontrol.evaluate.by_kernel import by_kernel
 from perfcontrol.evaluate.paths import devices_for, over_paths
 from perfcontrol.evaluate.rollout import (
     Path,
@@ -55,6 +56,11 @@ def path_gradient(problem: PerformativeProblem, path: Path | Trajectories) -> Ar
             return path_gradient(problem, Path(single.x, single.u, single.w, single.draws))
 
         return jnp.mean(jax.vmap(one)(path), axis=0)
+    return problem.structure.adjoint(_by_policy(problem, path))
+
+
+def _by_policy(problem: PerformativeProblem, path: Path) -> Array:
+    """The gradient by the full policy."""
     system = problem.system
     n, m = problem.state_size, problem.input_size
     acts_on_input = problem.perturbation.columns(n, m) > n
@@ -82,7 +88,7 @@ def path_gradient(problem: PerformativeProblem, path: Path | Trajectories) -> Ar
     if on_input is not None:
         by_v = by_v + on_input
     h = by_input.at[:-1].add(by_v)
-    return problem.structure.adjoint(feedforward_adjoint(h, path.w, problem.memory))
+    return feedforward_adjoint(h, path.w, problem.memory)
 
 
 def recover_noise(
@@ -113,6 +119,10 @@ def recover_noise(
     return x[1:] - jnp.einsum("tij,tj->ti", A, x[:-1]) - input_term(problem.system.B, u)
 
 
+def _sampled(problem: PerformativeProblem, policy: Array, deployed: Array, key: Key[Array, ""]) -> Array:
+    return _by_policy(problem, sample_along(problem, policy, deployed, key))
+
+
 def mean_path_gradient(
     problem: PerformativeProblem, M: Array, deployed: Array, key: Key[Array, ""], samples: int, devices: int = 1
 ) -> Array:
@@ -120,7 +130,8 @@ def mean_path_gradient(
     policy, reacting = problem.structure.lift(M), problem.structure.lift(deployed)
 
     def one(path_key: Array) -> Array:
-        return path_gradient(problem, sample_along(problem, policy, reacting, path_key))
+        by_policy = by_kernel(_sampled, problem, policy, reacting, path_key, gradient=True)
+        return problem.structure.adjoint(by_policy)
 
     if samples == 1:
         return one(key)

@@ -21,9 +21,6 @@ from perfcontrol.perturbations import Draws, PathDraws
 from perfcontrol.policy import feedforward
 from perfcontrol.problem import PerformativeProblem, check_problem
 
-LANES = 8  # paths worked on together: twice as fast as all at once
-CACHE = 2**24  # bytes of paths and perturbations beyond which working on more of them together slows them down
-
 
 class Path(eqx.Module):
     """One closed-loop path: x (T+1, n), u (T+1, m), w (T, n) and the perturbations drawn."""
@@ -52,18 +49,6 @@ class Trajectories(eqx.Module):
     draws: Draws
 
 
-class Estimate(eqx.Module):
-    """A sample mean with its standard error.
-
-    Attributes:
-        mean: any shape.
-        standard_error: the same shape.
-    """
-
-    mean: Float[Array, "..."]
-    standard_error: Float[Array, "..."]
-
-
 def input_term(B: Matrix, v: Float[Array, "T1 m"]) -> Float[Array, "T n"]:
     """B_t v_t for t = 0..T-1."""
     if isinstance(B, Diagonal):
@@ -80,11 +65,12 @@ def input_adjoint(B: Matrix, y: Float[Array, "T n"]) -> Float[Array, "T m"]:
 
 def draw_path(problem: PerformativeProblem, deployed: Array, key: Key[Array, ""]) -> tuple[Array, Array, Draws]:
     """Initial state (n,), noise (T, n) and perturbations of one path; `deployed` is lifted."""
-    x0, w, perturbation_key = _draw_noise(problem, deployed, key)
+    x0, w, perturbation_key = draw_noise(problem, deployed, key)
     return x0, w, problem.perturbation.sample(perturbation_key, deployed, problem.horizon)
 
 
-def _draw_noise(problem: PerformativeProblem, deployed: Array, key: Key[Array, ""]) -> tuple[Array, Array, Array]:
+def draw_noise(problem: PerformativeProblem, deployed: Array, key: Key[Array, ""]) -> tuple[Array, Array, Array]:
+    """Initial state (n,) and noise (T, n) of one path, and the key of its perturbations; `deployed` is lifted."""
     initial_key, noise_key, perturbation_key = jax.random.split(key, 3)
     x0 = problem.initial_state.sample(initial_key, 1)[0].astype(deployed.dtype)
     return x0, problem.noise_under(deployed).sample(noise_key, problem.horizon).astype(deployed.dtype), perturbation_key
@@ -97,7 +83,7 @@ def sample_path(problem: PerformativeProblem, policy: Array, deployed: Array, ke
 
 def sample_along(problem: PerformativeProblem, policy: Array, deployed: Array, key: Key[Array, ""]) -> Path:
     """A path of the same law whose perturbations serve for its cost and its gradient alone, and are drawn for less."""
-    x0, w, perturbation_key = _draw_noise(problem, deployed, key)
+    x0, w, perturbation_key = draw_noise(problem, deployed, key)
     draws = problem.perturbation.sample_along(perturbation_key, deployed, problem.horizon)
     return run_path(problem, policy, x0, w, draws)
 
@@ -157,19 +143,6 @@ def _simulate(
     return Trajectories(*over_paths(problem, one, key, samples, devices=devices))
 
 
-@program(on_device=True)
-def _path_costs(
-    problem: PerformativeProblem, M: Array, deployed: Array, key: Array, samples: int, devices: int
-) -> Array:
-    policy, reacting = problem.structure.lift(M), problem.structure.lift(deployed)
-
-    def one(key: Array) -> Array:
-        path = sample_along(problem, policy, reacting, key)
-        return jnp.sum(problem.cost.path_cost(path.x, path.u))
-
-    return over_paths(problem, one, key, samples, along=True, devices=devices)
-
-
 def check_pair(problem: PerformativeProblem, M: Any, deployed: Any) -> tuple[Array, Array]:
     """Both policies as arrays; `deployed=None` means M."""
     M = check_problem(problem).check_policy("M", M)
@@ -224,35 +197,3 @@ def simulate(
     if devices > 1:  # what is done with paths next is no affair of all devices
         paths = jax.device_put(paths, jax.local_devices()[0])
     return eqx.tree_at(lambda p: p.cost, paths, weight * paths.cost)
-
-
-def estimate_cost(
-    problem: PerformativeProblem,
-    M: Any,
-    *,
-    deployed: Any = None,
-    key: Any = None,
-    samples: int = 1024,
-    truncation: int | None = None,
-) -> Estimate:
-    """Monte Carlo estimate of C_T(M; deployed) with its standard error; needs no moments and any cost.
-
-    On an infinite horizon of the average cost per stage over `truncation` steps, x_0 included: its bias, of the order
-    1/truncation, is not in the standard error.
-
-    Args:
-        problem: the problem.
-        M: free policy parameters, `problem.policy_shape`.
-        deployed: likewise, the policy that the world reacts to; None for M itself.
-        key: JAX random key; required.
-        samples: number of paths.
-        truncation: T of the paths, for an infinite horizon and only there.
-
-    Raises:
-        InputError: as `simulate`; at least two samples are needed for a standard error.
-    """
-    M, reacting = check_pair(problem, M, deployed)
-    finite, weight = cut_off(problem, truncation)
-    key, samples = check_key(key), check_integer("samples", samples, 2)
-    costs = weight * _path_costs(finite, M, reacting, key, samples, devices_for(samples, finite, M, reacting, key))
-    return Estimate(jnp.mean(costs), jnp.std(costs, ddof=1) / jnp.sqrt(samples))

@@ -20,10 +20,12 @@ from perfcontrol.perturbations.base import (
     varying,
     zero_mean,
 )
+from perfcontrol.perturbations.counted import Counted
 from perfcontrol.perturbations.dependence import as_scale, check_values
 from perfcontrol.perturbations.scalar_laws import SCALAR_LAWS
 from perfcontrol.perturbations.white_draws import normal_draws, sphere_draws
 from perfcontrol.policy_maps import AbstractPolicyMap, as_policy_map, evaluate_map
+from perfcontrol.random_keys import is_fast
 from perfcontrol.random_vectors import AbstractRandomVector
 
 WHITE_LAWS = (*sorted(SCALAR_LAWS), "gaussian", "sphere")
@@ -175,8 +177,7 @@ class DensePerturbation(AbstractPerturbation):
         values = self._values(M)
         white = _White(None if self.law is None else self._vector(M), self.kind, self._shape(M), values.dtype)
         location = None if self.mean_map is None else evaluate_map(self.mean_map, M, "mean")
-        alike = self.law is None or self.law.covariance.ndim == 2  # at all times, as one drawn alone is taken to be
-        if alike and horizon * math.prod(white.shape) * values.dtype.itemsize > redrawn.HELD:
+        if self._is_redrawn(M, values, horizon):
             return redrawn.RedrawnDraws(key, jnp.arange(horizon), white, values, location)
 
         def matrices(key: Key[Array, "*paths"], values: Array, location: Array | None) -> Array:
@@ -192,6 +193,20 @@ class DensePerturbation(AbstractPerturbation):
             return self.sample(key, M, horizon)
         location = None if self.mean_map is None else evaluate_map(self.mean_map, M, "mean")
         return BY_PRODUCTS[self.kind](key, location, jnp.broadcast_to(values, (horizon,)), *self._shape(M))
+
+    def counted(self, key: Key[Array, ""], M: Array, horizon: int) -> Counted | None:
+        """What `sample` would draw, before it is drawn: signs or uniform entries of a common scale from a fast key."""
+        values = as_array("scale", evaluate_map(self.scale, M, "scale"))
+        if self.kind not in ("rademacher", "uniform") or values.ndim > 1 or not is_fast(key):
+            return None
+        location = None if self.mean_map is None else evaluate_map(self.mean_map, M, "mean")
+        scale = jnp.broadcast_to(values, (horizon,))
+        return Counted(key, scale, location, self.kind == "rademacher", self._is_redrawn(M, values, horizon))
+
+    def _is_redrawn(self, M: Array, values: Array, horizon: int) -> bool:
+        """Whether matrices, alike at all times, are too many to be held."""
+        alike = self.law is None or self.law.covariance.ndim == 2  # as one drawn alone is taken to be
+        return alike and horizon * math.prod(self._shape(M)) * values.dtype.itemsize > redrawn.HELD
 
     def _location(self, M: Array, horizon: int) -> Array:
         if self.mean_map is None:

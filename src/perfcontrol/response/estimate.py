@@ -12,7 +12,8 @@ from perfcontrol._checks import check_finite, check_instance, check_integer, che
 from perfcontrol._linalg import frobenius
 from perfcontrol._programs import known, numerics, on_host
 from perfcontrol.costs import ConvexCost, QuadraticCost
-from perfcontrol.evaluate.rollout import Estimate, simulate
+from perfcontrol.evaluate.estimate import Estimate
+from perfcontrol.evaluate.rollout import simulate
 from perfcontrol.problem import PerformativeProblem, check_end, check_problem
 from perfcontrol.response.quadratic import DENSE_LIMIT
 from perfcontrol.response.sampled import Sampled, Uncertainty, minimise, uncertainty

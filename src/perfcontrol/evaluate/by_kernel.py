@@ -1,0 +1,112 @@
+"""Costs and gradients of sampled paths by the kernel in C++, where it is switched on and knows the problem."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Key
+
+from perfcontrol._linalg import as_dense
+from perfcontrol.costs import QuadraticCost
+from perfcontrol.evaluate.rollout import draw_noise
+from perfcontrol.kernel.library import TARGET, in_use
+from perfcontrol.perturbations import DenseDraws, DensePerturbation, NoPerturbation
+from perfcontrol.perturbations.counted import Counted
+from perfcontrol.perturbations.white_draws import WhiteDraws
+from perfcontrol.problem import PerformativeProblem
+
+NONE, MATRICES, SIGNS, UNIFORM, PRODUCTS = range(5)  # `Reaction` in arguments.h
+Plain = Callable[[PerformativeProblem, Array, Array, Key[Array, ""]], Array]
+
+
+class _Reaction(NamedTuple):
+    """Δ as the kernel takes it: what is None is absent."""
+
+    kind: int
+    key: Array
+    scale: Array | None = None  # (T,)
+    location: Array | None = None  # (n, n), (T, n, n)
+    matrices: Array | None = None  # (T, n, n)
+    ahead: Array | None = None  # (T, n), as in `WhiteDraws`
+    back: Array | None = None  # (T, n)
+    rest: Array | None = None  # (T, 2)
+    each: bool = False
+
+
+def by_kernel(
+    plain: Plain, problem: PerformativeProblem, policy: Array, deployed: Array, key: Key[Array, ""], gradient: bool
+) -> Array:
+    """`plain(problem, policy, deployed, key)`: the cost of the path that the key draws, or its gradient.
+
+    `policy` and `deployed` are lifted, and so is the gradient. Derivatives are always those of `plain`.
+    """
+    if not in_use() or not _knows(problem, policy):
+        return plain(problem, policy, deployed, key)
+    dynamic, static = eqx.partition((problem, policy, deployed, key), eqx.is_array)
+
+    def run(dynamic: Any) -> Array:
+        problem, policy, deployed, key = eqx.combine(dynamic, static)
+        return _called(problem, policy, deployed, key, gradient)
+
+    differentiable = jax.custom_jvp(run)
+    differentiable.defjvp(lambda given, by: jax.jvp(lambda d: plain(*eqx.combine(d, static)), given, by))
+    return differentiable(dynamic)
+
+
+def _knows(problem: PerformativeProblem, policy: Array) -> bool:
+    perturbation, n = problem.perturbation, problem.state_size
+    dense = isinstance(perturbation, DensePerturbation) and perturbation.columns(n, problem.input_size) == n
+    one_precision = policy.dtype == problem.dtype and problem.dtype in (np.float32, np.float64)
+    return (
+        isinstance(problem.cost, QuadraticCost)
+        and (dense or isinstance(perturbation, NoPerturbation))
+        and one_precision
+    )
+
+
+def _called(problem: PerformativeProblem, policy: Array, deployed: Array, key: Key[Array, ""], gradient: bool) -> Array:
+    x0, w, perturbation_key = draw_noise(problem, deployed, key)
+    reaction = _reaction(problem, deployed, perturbation_key)
+    Q, R, cross = problem.cost.weights(problem.horizon)  # type: ignore[attr-defined]
+    system, cost, dtype = problem.system, problem.cost, policy.dtype
+    gain = problem.gain if problem.has_gain else None
+
+    def given(array: Any, inner: int) -> Array:
+        """With a leading axis of length 0 where absent, 1 where the same at all times."""
+        if array is None:
+            return jnp.zeros((0,) + (1,) * inner, dtype)
+        dense = jnp.asarray(as_dense(array), dtype)
+        return dense if dense.ndim > inner else dense[None]
+
+    matrices = [given(matrix, 2) for matrix in (system.A, system.B, gain, Q, R, cross)]
+    targets = [given(target, 1) for target in (cost.state_target, cost.input_target)]  # type: ignore[attr-defined]
+    scale = None if reaction.scale is None else reaction.scale[:, None]
+    drawn = [given(scale, 1), given(reaction.location, 2), given(reaction.matrices, 2)]
+    drawn += [given(array, 1) for array in (reaction.ahead, reaction.back, reaction.rest)]
+    answers = jax.ShapeDtypeStruct((), dtype), jax.ShapeDtypeStruct(policy.shape if gradient else (0,), dtype)
+    call = jax.ffi.ffi_call(TARGET, answers, vmap_method="expand_dims")
+    options = {"reaction": np.int64(reaction.kind), "redrawn": reaction.each, "gradient": gradient}
+    path_cost, by_policy = call(*matrices, *targets, policy, x0, w, *drawn, reaction.key, **options)
+    return by_policy if gradient else path_cost
+
+
+def _reaction(problem: PerformativeProblem, deployed: Array, key: Key[Array, ""]) -> _Reaction:
+    perturbation, horizon = problem.perturbation, problem.horizon
+    nothing = jnp.zeros(4, np.uint32)
+    if not isinstance(perturbation, DensePerturbation):
+        return _Reaction(NONE, nothing)
+    counted = perturbation.counted(key, deployed, horizon)
+    if isinstance(counted, Counted):
+        kind = SIGNS if counted.signs else UNIFORM
+        words = jax.random.key_data(counted.key)
+        return _Reaction(kind, words, counted.scale, counted.location, each=counted.each)
+    draws = perturbation.sample_along(key, deployed, horizon)
+    if isinstance(draws, WhiteDraws):
+        return _Reaction(
+            PRODUCTS, nothing, draws.scale, draws.location, ahead=draws.ahead, back=draws.back, rest=draws.rest
+        )
+    matrices = draws.matrices if isinstance(draws, DenseDraws) else draws.dense()  # type: ignore[attr-defined]
+    return _Reaction(MATRICES, nothing, jnp.ones(1, deployed.dtype), matrices=matrices)
