@@ -147,7 +147,7 @@ def is_fast(keys: Key[Array, "*keys"]) -> bool:
 
 @functools.cache
 def _kind() -> Any:
-    return jax.random.key_impl(jax.random.wrap_key_data(np.zeros(4, np.uint32), impl=SQUARES))
+    return jax.random.key_impl(jax.random.wrap_key_data(jnp.zeros(4, np.uint32), impl=SQUARES))
 
 
 def random_words(keys: Key[Array, "*keys"], count: int, width: int) -> UInt32[Array, "count *keys"] | Array:

@@ -11,7 +11,7 @@ from jaxtyping import Array, Key
 
 from perfcontrol._linalg import as_dense
 from perfcontrol.costs import QuadraticCost
-from perfcontrol.evaluate.rollout import draw_noise
+from perfcontrol.evaluate.draw import draw_noise
 from perfcontrol.kernel.library import TARGET, in_use
 from perfcontrol.perturbations import DenseDraws, DensePerturbation, NoPerturbation
 from perfcontrol.perturbations.counted import Counted
@@ -43,7 +43,7 @@ def by_kernel(
 
     `policy` and `deployed` are lifted, and so is the gradient. Derivatives are always those of `plain`.
     """
-    if not in_use() or not _knows(problem, policy):
+    if not serves(problem) or policy.dtype != problem.dtype:
         return plain(problem, policy, deployed, key)
     dynamic, static = eqx.partition((problem, policy, deployed, key), eqx.is_array)
 
@@ -56,15 +56,12 @@ def by_kernel(
     return differentiable(dynamic)
 
 
-def _knows(problem: PerformativeProblem, policy: Array) -> bool:
+def serves(problem: PerformativeProblem) -> bool:
+    """Whether the kernel is switched on, and knows problems of this kind."""
     perturbation, n = problem.perturbation, problem.state_size
     dense = isinstance(perturbation, DensePerturbation) and perturbation.columns(n, problem.input_size) == n
-    one_precision = policy.dtype == problem.dtype and problem.dtype in (np.float32, np.float64)
-    return (
-        isinstance(problem.cost, QuadraticCost)
-        and (dense or isinstance(perturbation, NoPerturbation))
-        and one_precision
-    )
+    known = (dense or isinstance(perturbation, NoPerturbation)) and isinstance(problem.cost, QuadraticCost)
+    return in_use() and known and problem.dtype in (np.float32, np.float64)
 
 
 def _called(problem: PerformativeProblem, policy: Array, deployed: Array, key: Key[Array, ""], gradient: bool) -> Array:

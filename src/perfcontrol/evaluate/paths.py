@@ -12,10 +12,12 @@ from jaxtyping import Array, Key
 
 from perfcontrol._linalg import FUSED
 from perfcontrol._programs import known
+from perfcontrol.evaluate import by_kernel
 from perfcontrol.problem import PerformativeProblem
 
 LANES = 8  # paths that a device should have at least
 REGISTER = 32  # bytes of one number of all paths worked on together: with more the compiler leaves vectors alone
+REGISTERS = 8  # of paths for one call of the kernel
 CACHE = 2**24  # bytes of paths beyond which working on more of them together slows them down
 
 
@@ -42,11 +44,16 @@ def bytes_held(problem: PerformativeProblem, along: bool = False) -> int:
 def lanes(problem: PerformativeProblem, along: bool = False) -> int:
     """How many paths a batched loop works on together: a register's, fewer where what they hold leaves the cache.
 
-    Paths that have large matrices of their own are better worked on one by one.
+    Paths that have large matrices of their own are better worked on one by one; the kernel is given several registers
+    of them at once.
     """
+    register = REGISTER // problem.dtype.itemsize
+    fitting = CACHE // bytes_held(problem, along)
+    if by_kernel.serves(problem):
+        return max(register, min(REGISTERS * register, fitting))
     if any(leaf.ndim == 3 and max(leaf.shape[1:]) > FUSED for leaf in _drawn(problem, along)):
         return 1
-    return max(1, min(REGISTER // problem.dtype.itemsize, CACHE // bytes_held(problem, along)))
+    return max(1, min(register, fitting))
 
 
 def devices_for(samples: int, *given: Any) -> int:

@@ -15,6 +15,7 @@ from perfcontrol._checks import check_integer, check_key, fail
 from perfcontrol._linalg import Diagonal, Matrix, along_time, times
 from perfcontrol._memory import memory_size
 from perfcontrol._programs import program
+from perfcontrol.evaluate.draw import draw_noise, draw_path
 from perfcontrol.evaluate.paths import bytes_held, devices_for, over_paths
 from perfcontrol.evaluate.time_loop import time_loop
 from perfcontrol.perturbations import Draws, PathDraws
@@ -61,19 +62,6 @@ def input_adjoint(B: Matrix, y: Float[Array, "T n"]) -> Float[Array, "T m"]:
     if isinstance(B, Diagonal):
         return B.values * y
     return y @ B if B.ndim == 2 else jnp.einsum("tnm,tn->tm", B, y)
-
-
-def draw_path(problem: PerformativeProblem, deployed: Array, key: Key[Array, ""]) -> tuple[Array, Array, Draws]:
-    """Initial state (n,), noise (T, n) and perturbations of one path; `deployed` is lifted."""
-    x0, w, perturbation_key = draw_noise(problem, deployed, key)
-    return x0, w, problem.perturbation.sample(perturbation_key, deployed, problem.horizon)
-
-
-def draw_noise(problem: PerformativeProblem, deployed: Array, key: Key[Array, ""]) -> tuple[Array, Array, Array]:
-    """Initial state (n,) and noise (T, n) of one path, and the key of its perturbations; `deployed` is lifted."""
-    initial_key, noise_key, perturbation_key = jax.random.split(key, 3)
-    x0 = problem.initial_state.sample(initial_key, 1)[0].astype(deployed.dtype)
-    return x0, problem.noise_under(deployed).sample(noise_key, problem.horizon).astype(deployed.dtype), perturbation_key
 
 
 def sample_path(problem: PerformativeProblem, policy: Array, deployed: Array, key: Key[Array, ""]) -> Path:
