@@ -15,6 +15,7 @@ from perfcontrol.evaluate.rollout import sample_path
 from perfcontrol.experiments.batches import in_single_precision
 
 SEEDS = 288
+BY_KERNEL = ", by the kernel"
 LANES = (4, 8, 16)
 
 
@@ -66,6 +67,13 @@ def sampled_rows(name: str, problem: pc.PerformativeProblem, printed: float) -> 
         rows.append(path_row(name, label, p, M.astype(p.dtype), printed))
         rows += seed_rows(name, label, p, M.astype(p.dtype), printed)
     return rows
+
+
+def kernel_rows(name: str, problem: pc.PerformativeProblem, printed: float) -> list[Row]:
+    """`sampled_rows` by the kernel in C++, which must be switched on: one path in float64, many seeds in float32."""
+    M, single = policy_of(problem), in_single_precision(problem)
+    one = path_row(name, f"float64{BY_KERNEL}", problem, M, printed)
+    return [one, *seed_rows(name, f"float32{BY_KERNEL}", single, M.astype(single.dtype), printed)]
 
 
 def numpy_baselines(problem: pc.PerformativeProblem, M: jax.Array) -> tuple[float, float]:

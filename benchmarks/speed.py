@@ -10,7 +10,7 @@ import jax
 import perfcontrol as pc
 from benchmarks.evaluation import exact_rows, stable_rows, sweep_rows
 from benchmarks.goals import goals_table
-from benchmarks.gradients import gradient_rows, lane_rows, sampled_rows, seed_rows
+from benchmarks.gradients import gradient_rows, kernel_rows, lane_rows, sampled_rows, seed_rows
 from benchmarks.limits import machine_rows, scaling_rows
 from benchmarks.measure import Row, as_markdown
 from benchmarks.problems import SHAPES, policy_of, problem_of
@@ -38,6 +38,12 @@ def table(quick: bool) -> str:
         f"dense, uniform entries {SMALL}", "float32, JAX's default key", uniform, M, printed[SMALL], jax.random.key(3)
     )
     rows += lane_rows(f"dense, uniform entries {SMALL}", "float32", uniform, M, printed[SMALL])
+    pc.use_kernel()
+    for name, shape in SHAPES.items():
+        if name in printed and name != "(4, 10, 200)":
+            for law, kind in LAWS.items():
+                rows += kernel_rows(f"dense, {kind} {name}", problem_of(*shape, law=law), printed[name])
+    pc.use_kernel(False)
     directional, stock = problem_of(20, 1, 60, "directional"), pc.experiments.stock_market("random")
     families = {"dense": problem_of(20, 1, 60), "directional": directional, "stock": stock}
     for kind in ("directional", "stock"):

@@ -245,6 +245,25 @@ def test_what_is_not_finite_stays_so(kernel):
     assert np.all(np.isfinite(ended.M))
 
 
+def test_run_begun_without_the_kernel_does_not_go_on_with_it(kernel, tmp_path):
+    problem, solver = plain_problem(), pc.RSGD(4, 0.001)
+
+    class StoppedError(Exception):
+        pass
+
+    def stop(done, total):
+        raise StoppedError
+
+    def begin(progress=None):
+        return pc.solve(problem, solver, key=pc.fast_key(9), checkpoint=tmp_path / "run", progress=progress)
+
+    kernel(False)
+    with pytest.raises(StoppedError):
+        begin(stop)
+    kernel(True)
+    assert_refused(begin, "checkpoint", "kernel in use")
+
+
 # --- the compiler ----------------------------------------------------------------------------------------------------
 
 

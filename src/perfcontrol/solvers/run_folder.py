@@ -18,6 +18,7 @@ from perfcontrol._files import leftovers, naming, written_whole
 from perfcontrol._fingerprint import fingerprint
 from perfcontrol._lock import NAME as LOCK
 from perfcontrol._lock import locked
+from perfcontrol.kernel import in_use
 
 FORMAT = "perfcontrol run 1"
 RUN = "run.json"
@@ -117,7 +118,8 @@ def held(folder: Any, process: int | None = None) -> Iterator[Path]:
 def _versions() -> dict[str, str]:
     """What the bits of a result depend on, besides the run itself."""
     packages = {name: importlib.metadata.version(name) for name in ("jax", "jaxlib", "numpy", "scipy")}
-    return packages | {"platform": f"{jax.default_backend()} {platform.machine()}"}
+    kernel = {"kernel": "in use"} if in_use() else {}
+    return packages | {"platform": f"{jax.default_backend()} {platform.machine()}"} | kernel
 
 
 def _listed(versions: Any) -> str:
