@@ -320,6 +320,7 @@ WRONG = {
         "no logs to test": (lambda: pc.test_reaction(None), "logs", "pc.Logs(x, u, deployed)"),
         "folder as a number": (lambda: pc.cache(3), "path", "folder"),
         "seed of a key as a fraction": (lambda: pc.fast_key(2.5), "seed", "integer"),
+        "switch that is neither on nor off": (lambda: pc.use_kernel("on"), "on", "True or False"),
         "unknown order": (lambda: pc.experiments.stock_market("up"), "order", "'up'"),
         "unknown set": (lambda: pc.experiments.stock_market(feasible_set="box"), "feasible_set", "'box'"),
         "order of sensitivities": (lambda: pc.experiments.stock_sensitivities(3), "order", "got 3"),

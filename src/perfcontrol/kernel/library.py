@@ -46,17 +46,19 @@ def use_kernel(on: bool = True) -> None:
         on: False switches it off.
 
     Raises:
-        InputError: there is no C++ compiler, or it fails.
+        InputError: neither True nor False; there is no C++ compiler, or it fails.
 
     >>> import perfcontrol as pc
     >>> pc.use_kernel(False)
     """
+    if not isinstance(on, bool):
+        raise fail("on", repr(on), "be True or False", "Write pc.use_kernel() or pc.use_kernel(False).")
     if on and not _Switch.loaded:
         library = ctypes.CDLL(str(compiled()))
         jax.ffi.register_ffi_target(TARGET, jax.ffi.pycapsule(library.PerfcontrolPaths), platform="cpu")
         _Switch.loaded = True
     if on != _Switch.on:
-        _Switch.on = bool(on)
+        _Switch.on = on
         jax.clear_caches()
 
 
