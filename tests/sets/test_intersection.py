@@ -6,6 +6,8 @@ import pytest
 import scipy.optimize
 
 import perfcontrol as pc
+from perfcontrol.sets.intersection.dykstra import split_at
+from perfcontrol.sets.intersection.newton import Linearised
 from perfcontrol.sets.intersection.projection import solve
 from tests.contracts.feasible_set import SetContract
 from tests.tools import assert_close, assert_refused, normal, tolerance
@@ -202,3 +204,18 @@ def _problem(feasible_set):
 @pytest.mark.parametrize("case", REFUSED.values(), ids=REFUSED.keys())
 def test_intersection_is_refused_with_a_four_part_error(case):
     assert_refused(*case)
+
+
+def test_newton_step_solves_the_linearised_equations_of_the_projection():
+    """dx = J_i (dx + dp_i) + e_i and dx + Σ dp_i = dy as one dense system, the J_i known by hand."""
+    sets, shape, size = (pc.Box(0.0, 0.6), pc.RowSum(1.0)), (1, 1, 4), 4
+    x = jnp.array([-0.2, 0.1, 0.3, 0.9])  # the first and the last beyond the box
+    split = split_at(sets, x, jnp.zeros((2, size)), shape)
+    slopes = [np.diag([0.0, 1.0, 1.0, 0.0]), np.eye(size) - np.ones((size, size)) / size]
+    errors, dy = np.asarray(normal(30, 2, size)), np.asarray(normal(31, size))
+    eye, zero = np.eye(size), np.zeros((size, size))
+    system = np.block([[eye - slopes[0], -slopes[0], zero], [eye - slopes[1], zero, -slopes[1]], [eye, eye, eye]])
+    right = np.concatenate([errors[0], errors[1], dy])
+    known = np.linalg.lstsq(system, right, rcond=None)[0]
+    assert_close(system @ known, right, 1e-12, 1e-5)
+    assert_close(Linearised(sets, split, shape).move(jnp.asarray(errors), jnp.asarray(dy)), known[:size], 1e-9, 1e-3)

@@ -47,6 +47,14 @@ def test_policy_is_the_mean_of_the_iterates_after_the_burn_in(feasible_set):
     assert int(averaged.stats["averaged"]) == 6
 
 
+def test_one_iterate_is_enough_to_average_where_derivatives_are_exact():
+    problem = drifting(0)
+    average = pc.Average(burn_in=0.9)
+    averaged = pc.solve(problem, pc.RSGD(1, 0.01, average=average), key=KEY)
+    assert int(averaged.stats["averaged"]) == 1
+    assert_close(averaged.M, pc.solve(problem, pc.RSGD(1, 0.01), key=KEY).M, 1e-12)
+
+
 def test_average_of_a_failed_run_is_finite_and_its_region_refused():
     problem = performative_prediction(0.5)
     solution = pc.solve(problem, pc.RSGD(100, 8.0, average=pc.Average(0.0)), key=KEY, throw=False)

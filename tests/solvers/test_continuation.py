@@ -28,6 +28,15 @@ class TestContinuation(SolverContract):
             assert bool(solution.stats["unique"])
 
 
+def test_first_step_stays_at_the_anchor_and_finds_the_scale_of_the_curve():
+    problem = drifting(0)
+    began = SOLVER.init(problem, np.zeros(problem.policy_shape))
+    state = SOLVER.step(problem, began, None)
+    assert float(began.own.scale) == 0 < float(state.own.scale)
+    assert float(state.own.level) == 0 < float(state.own.length)
+    assert float(SOLVER.step(problem, state, None).own.level) > 0
+
+
 def reacting_mean(seed: int, strength: float, feasible_set=None) -> pc.PerformativeProblem:
     """A mean that reacts so strongly that the best response jumps about on a ball's surface and through it."""
     return pc.PerformativeProblem(

@@ -31,6 +31,19 @@ def mean(M):
     return {"M": M, "mean": M.mean()}
 
 
+def test_runs_whose_large_matrices_are_never_drawn_are_worked_on_together():
+    n = 40
+    problem = pc.PerformativeProblem(
+        system=pc.LinearSystem(0.5 * np.eye(n), np.eye(n)),
+        horizon=3,
+        noise=pc.Rademacher(np.ones(n)),
+        cost=pc.QuadraticCost(np.eye(n), np.eye(n)),
+        perturbation=pc.DensePerturbation(0.01, law="gaussian"),
+    )
+    assert blocks.lanes_of(problem, pc.RSGD(3, 0.1), 64) == 4
+    assert blocks.lanes_of(problem, pc.RSGD(3, 0.1, gradient=pc.EstimatedDynamics()), 64) == 1
+
+
 @pytest.mark.float32
 def test_runs_equal_those_of_solve_for_every_problem_solver_and_key():
     every = 7

@@ -48,6 +48,11 @@ class AbstractSolver(eqx.Module):
         return False
 
     @property
+    def draws_along(self) -> bool:
+        """Whether all that steps draw are paths for a cost or a gradient, of whose perturbations less is drawn."""
+        return False
+
+    @property
     def from_host(self) -> bool:
         """Whether steps do their heavy work in programs of their own, so that the loop need not be compiled."""
         return False

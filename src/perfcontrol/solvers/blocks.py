@@ -71,7 +71,7 @@ class Work(NamedTuple):
 
 def lanes_of(problem: PerformativeProblem, solver: AbstractSolver, count: int) -> int:
     """How many of `count` runs a device works on together; one where steps branch: lanes would take every branch."""
-    together = 1 if solver.from_host else lanes(problem) if problem.is_finite else LANES
+    together = 1 if solver.from_host else lanes(problem, solver.draws_along) if problem.is_finite else LANES
     return max(1, min(together, math.ceil(count / len(jax.local_devices()))))
 
 

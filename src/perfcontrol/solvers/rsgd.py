@@ -111,6 +111,10 @@ class RSGD(AbstractSolver):
     def needs_key(self) -> bool:
         return getattr(self.gradient, "needs_key", True)
 
+    @property
+    def draws_along(self) -> bool:
+        return isinstance(self.gradient, Pathwise)
+
     def check(self, problem: PerformativeProblem) -> None:
         self.gradient.check(problem)
         simulated, _ = self._simulated(problem)

@@ -29,7 +29,8 @@ class Linearised:
             slopes.append(jax.jacfwd(flat)(split.x + part))
         values, vectors = jnp.linalg.eigh(symmetrise(jnp.stack(slopes)))
         kept = (values > negligible)[:, None, :]
-        self.inverses = (vectors * jnp.where(kept, 1 / jnp.where(kept, values[:, None, :], 1), 0)) @ transpose(vectors)
+        # What stands along the null spaces does not matter: `free` takes it out of every product.
+        self.inverses = (vectors / jnp.where(kept, values[:, None, :], 1)) @ transpose(vectors)
         self.normals = (vectors * ~kept) @ transpose(vectors)
         values, vectors = jnp.linalg.eigh(jnp.sum(self.normals, axis=0))
         fixed = values > 10 * negligible
