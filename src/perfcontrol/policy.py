@@ -50,8 +50,9 @@ class DisturbanceAction(eqx.Module):
 def lagged(w: Float[Array, "T n"], memory: int) -> Float[Array, "T1 H n"]:
     """lagged(w, H)[t, i-1] = w_{t-i} for t = 0..T, zero where t < i.
 
-    >>> lagged(jnp.array([[1.0], [2.0], [3.0]]), memory=2)[..., 0].tolist()
-    [[0.0, 0.0], [1.0, 0.0], [2.0, 1.0], [3.0, 2.0]]
+    Examples:
+        >>> lagged(jnp.array([[1.0], [2.0], [3.0]]), memory=2)[..., 0].tolist()
+        [[0.0, 0.0], [1.0, 0.0], [2.0, 1.0], [3.0, 2.0]]
     """
     horizon = w.shape[0]
     padded = jnp.concatenate([jnp.zeros((memory, w.shape[1]), w.dtype), w])

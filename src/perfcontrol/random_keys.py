@@ -128,10 +128,11 @@ def fast_key(seed: Any) -> Key[Array, ""]:
     References:
         B. Widynski, *Squares: a fast counter-based RNG*, arXiv:2004.06278; the keys are this module's own.
 
-    >>> import jax
-    >>> import perfcontrol as pc
-    >>> jax.random.uniform(pc.fast_key(0), (2,)).shape
-    (2,)
+    Examples:
+        >>> import jax
+        >>> import perfcontrol as pc
+        >>> jax.random.uniform(pc.fast_key(0), (2,)).shape
+        (2,)
     """
     whole = seed if isinstance(seed, jax.Array) else np.asarray(seed)
     fits = whole.shape == () and jnp.issubdtype(whole.dtype, jnp.integer)

@@ -48,8 +48,9 @@ def use_kernel(on: bool = True) -> None:
     Raises:
         InputError: neither True nor False; there is no C++ compiler, or it fails.
 
-    >>> import perfcontrol as pc
-    >>> pc.use_kernel(False)
+    Examples:
+        >>> import perfcontrol as pc
+        >>> pc.use_kernel(False)
     """
     if not isinstance(on, bool):
         raise fail("on", repr(on), "be True or False", "Write pc.use_kernel() or pc.use_kernel(False).")

@@ -4,7 +4,17 @@ import equinox as eqx
 
 
 class Result(eqx.Enumeration):
-    """Outcome of `solve`; compare with ==, read the text with `Result[result]`."""
+    """Outcome of `solve`; compare with ==, read the text, which says what to do, with `Result[result]`.
+
+    Attributes:
+        success: the run ended as asked.
+        running: stopped by max_steps before it ended.
+        diverged: the iterates grew past the divergence threshold.
+        nonfinite: a gradient or iterate was not finite.
+        undersampled: the sample reached its limit before the standard error met the tolerance.
+        not_differentiable: the reaction has no finite derivative at a policy on the way.
+        not_converged: the tolerance was not reached.
+    """
 
     success = "The run ended as asked."
     running = "The run was stopped by max_steps before it ended: raise max_steps."

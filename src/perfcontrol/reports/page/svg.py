@@ -46,8 +46,9 @@ def draw(width: float, height: float, alt: str, prefix: str, plot: Callable[[Axe
 def inline(svg: str, alt: str, prefix: str) -> str:
     """SVG of Matplotlib for use inside HTML.
 
-    >>> inline('<svg xmlns="http://x" viewBox="0 0 1 1"><g id="a"/><use xlink:href="#a"/></svg>', "dot", "f1")
-    '<svg viewBox="0 0 1 1" role="img" aria-label="dot"><g id="f1-a"/><use href="#f1-a"/></svg>'
+    Examples:
+        >>> inline('<svg xmlns="http://x" viewBox="0 0 1 1"><g id="a"/><use xlink:href="#a"/></svg>', "dot", "f1")
+        '<svg viewBox="0 0 1 1" role="img" aria-label="dot"><g id="f1-a"/><use href="#f1-a"/></svg>'
     """
     body = svg[svg.index("<svg") :]
     opening, _, body = body.partition(">")
