@@ -23,7 +23,8 @@ if TYPE_CHECKING:
 else:
     Numbers = jax.Array | np.ndarray | np.generic  # known, or traced
 
-# XLA's newer emitters for the CPU take twice as long to compile these programs and run them no faster.
+# XLA's newer emitters for the CPU take twice as long to compile these programs and run them no faster, save where many
+# numbers lie side by side.
 QUICK = {"xla_cpu_use_fusion_emitters": False}
 
 
@@ -49,12 +50,13 @@ def _is_array(leaf: Any) -> bool:
 class Program:
     """A pure function, compiled on first use for each kind of arguments; arrays are inputs, all else is fixed.
 
-    Known arguments give NumPy arrays (JAX arrays with `on_device=True`); traced ones are worked on in place.
+    Known arguments give NumPy arrays (JAX arrays with `on_device=True`); traced ones are worked on in place. `quick`
+    is about the time to compile.
     """
 
-    def __init__(self, function: Callable, on_device: bool):
+    def __init__(self, function: Callable, on_device: bool, quick: bool):
         functools.update_wrapper(self, function)
-        self.function, self.on_device = function, on_device
+        self.function, self.on_device, self.quick = function, on_device, quick
 
     def _jit(self, **options: Any) -> Callable:
         def run(fixed: tuple[Any, tuple], inputs: list) -> Any:
@@ -68,7 +70,7 @@ class Program:
 
     @functools.cached_property
     def _standing(self) -> Callable:
-        return self._jit(compiler_options=compiler_options())
+        return self._jit(compiler_options=compiler_options() if self.quick else None)
 
     @functools.cached_property
     def _inlined(self) -> Callable:
@@ -94,11 +96,11 @@ class Program:
             return self._standing(fixed, inputs)
 
 
-def program(function: Callable | None = None, *, on_device: bool = False) -> Any:
+def program(function: Callable | None = None, *, on_device: bool = False, quick: bool = True) -> Any:
     """Make `function` a `Program`; with `on_device=True` its answers stay JAX arrays."""
     if function is None:
-        return functools.partial(program, on_device=on_device)
-    return Program(function, on_device)
+        return functools.partial(program, on_device=on_device, quick=quick)
+    return Program(function, on_device, quick)
 
 
 def numerics(*trees: Any) -> tuple[ModuleType, ModuleType]:

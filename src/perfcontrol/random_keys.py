@@ -23,7 +23,7 @@ import jax.extend
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Key, UInt32, UInt64
+from jaxtyping import Array, Float, Key, UInt32, UInt64
 
 from perfcontrol._checks import fail
 
@@ -159,3 +159,12 @@ def random_words(keys: Key[Array, "*keys"], count: int, width: int) -> UInt32[Ar
         data = jnp.moveaxis(jax.random.key_data(keys), -1, 0)
         return _in_64_bits(lambda data: _numbers(data, width, lax.iota(np.uint64, count)[:, None]))(data)
     return jax.vmap(lambda key: random_words(key, count, width), out_axes=-1)(keys)
+
+
+def unit_numbers(keys: Key[Array, "*keys"], count: int, dtype: Any) -> Float[Array, "count *keys"]:
+    """`jax.random.uniform(key, (count,), dtype)`, in [0, 1), of one key or of several side by side."""
+    width, digits = jnp.finfo(dtype).bits, jnp.finfo(dtype).nmant
+    words = random_words(keys, count, width)
+    # The highest bits of a word as the digits of a number in [1, 2).
+    one = np.ones((), dtype).view(words.dtype)
+    return lax.bitcast_convert_type((words >> np.array(width - digits, words.dtype)) | one, dtype) - 1

@@ -5,11 +5,10 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Key
 
-from perfcontrol.random_keys import random_words
+from perfcontrol.random_keys import unit_numbers
 from perfcontrol.random_vectors import random_signs
 
 CUTOFF = 3.0  # the Gaussian is cut at this many of its own standard deviations before it is normalised
@@ -28,12 +27,8 @@ class ScalarLaw(NamedTuple):
 
 
 def _uniform(key: Key[Array, "*keys"], shape: tuple[int, ...], dtype: Any) -> Array:
-    width, digits = jnp.finfo(dtype).bits, jnp.finfo(dtype).nmant
-    words = random_words(key, math.prod(shape), width).reshape(*shape, *key.shape)
-    # The highest bits of a word as the digits of a number in [1, 2).
-    one = np.ones((), dtype).view(words.dtype)
-    number = jax.lax.bitcast_convert_type((words >> np.array(width - digits, words.dtype)) | one, dtype)
-    return (number - 1) * np.array(2 * math.sqrt(3), dtype) - np.array(math.sqrt(3), dtype)
+    number = unit_numbers(key, math.prod(shape), dtype).reshape(*shape, *key.shape)
+    return number * np.array(2 * math.sqrt(3), dtype) - np.array(math.sqrt(3), dtype)
 
 
 def _truncated_gaussian(key: Key[Array, "*keys"], shape: tuple[int, ...], dtype: Any) -> Array:

@@ -30,6 +30,14 @@ def _growth(volatility: Any, rate: Any, horizon: int, xp: Any) -> Any:
     return xp.exp((rate - volatility**2 / 2) / horizon + volatility / math.sqrt(horizon))
 
 
+def price_ratios(unit: Array, log_sensitivity: Array, rate: Any, horizon: int, kind: str) -> Array:
+    """The ratios that `StochasticVolatility` makes of numbers uniform on [0, 1)."""
+    # As jax.random.normal: uniform on (-1, 1), which -1 itself does not belong to.
+    above = np.nextafter(unit.dtype.type(-1), unit.dtype.type(0))
+    normal = math.sqrt(2) * jax.lax.erf_inv(jnp.maximum(unit * (1 - above) + above, above))
+    return _growth(_volatility(normal, log_sensitivity, kind, jnp), rate, horizon, jnp)
+
+
 def growth_moments(log_sensitivity: np.ndarray, rate: float, kind: str) -> tuple[np.ndarray, np.ndarray]:
     """E e and E e² for each time, by Gauss-Legendre quadrature between the kinks of the clip."""
     horizon = len(log_sensitivity)
@@ -119,14 +127,10 @@ class StochasticVolatility(AbstractRandomVector):
         return _growth(low, self.rate, horizon, jnp), _growth(LIMIT, self.rate, horizon, jnp)
 
     def sample(self, key: Key[Array, ""], horizon: int) -> Array:
-        def of_stock(uniform: Array) -> Array:
-            normal = math.sqrt(2) * jax.lax.erf_inv(uniform)
-            volatility = _volatility(normal, self.log_sensitivity, self.volatility, jnp)
-            return _growth(volatility, self.rate, self.log_sensitivity.shape[0], jnp)
+        def of_stock(unit: Array) -> Array:
+            return price_ratios(unit, self.log_sensitivity, self.rate, len(self.log_sensitivity), self.volatility)
 
-        # The numbers of jax.random.normal. Stock by stock, since XLA would otherwise work day by day on vectors of a
-        # few stocks, which takes over twice as long.
-        dtype = self.log_sensitivity.dtype
-        above = np.nextafter(dtype.type(-1), dtype.type(0))
-        uniform = jax.random.uniform(key, (horizon, *self._ones.shape), dtype, above, 1)
-        return jax.lax.map(of_stock, uniform.T).T
+        # Stock by stock, since XLA would otherwise work day by day on vectors of a few stocks, which takes over twice
+        # as long.
+        unit = jax.random.uniform(key, (horizon, *self._ones.shape), self.log_sensitivity.dtype)
+        return jax.lax.map(of_stock, unit.T).T

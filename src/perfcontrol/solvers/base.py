@@ -57,6 +57,11 @@ class AbstractSolver(eqx.Module):
         """Whether steps do their heavy work in programs of their own, so that the loop need not be compiled."""
         return False
 
+    @property
+    def lanes(self) -> int | None:
+        """How many runs `solve_many` works on together on a device; None: as many as simulation does well with."""
+        return None
+
     def rescue(self, problem: PerformativeProblem) -> "AbstractSolver | None":
         """The method that `solve` tries from the same start where this one fails; None: the failure is reported."""
         return None

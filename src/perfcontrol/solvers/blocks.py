@@ -14,12 +14,13 @@ from perfcontrol.evaluate.paths import LANES, lanes
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.solvers.base import AbstractSolver
 from perfcontrol.solvers.result import Result
-from perfcontrol.solvers.rows import Rows, Shared, advance, begin, finish
+from perfcontrol.solvers.rows import Rows, Shared, advance, advance_wide, begin, finish
 from perfcontrol.solvers.run_folder import RunFolder
 from perfcontrol.solvers.runs import Record
 
 CHUNK = 100  # iterations compiled together
 ROUNDS = 4  # groups of lanes that a device works through in one compiled call
+WIDE = 16  # lanes from which on the compiler makes vectors of all that lies side by side, in multiples of these
 
 
 class Work(NamedTuple):
@@ -53,7 +54,8 @@ class Work(NamedTuple):
         return _on_host(ended) | {"history": jax.tree.map(lambda *parts: _whole(parts, length), *history)}
 
     def _advanced(self, rows: Rows, state: Any, first: int, count: int, record: Record | None, every: int) -> Any:
-        return advance(self.lanes, record, every, count, self.shared, rows, state, np.asarray(first))
+        program = advance if self.shared.solvers.lanes is None else advance_wide
+        return program(self.lanes, record, every, count, self.shared, rows, state, np.asarray(first))
 
     def blank(self, rows: Rows) -> dict[str, Any]:
         """What `run` returns for these rows, in shapes alone."""
@@ -71,8 +73,11 @@ class Work(NamedTuple):
 
 def lanes_of(problem: PerformativeProblem, solver: AbstractSolver, count: int) -> int:
     """How many of `count` runs a device works on together; one where steps branch: lanes would take every branch."""
+    share = math.ceil(count / len(jax.local_devices()))
+    if solver.lanes is not None:
+        return min(solver.lanes, WIDE * math.ceil(share / WIDE))
     together = 1 if solver.from_host else lanes(problem, solver.draws_along) if problem.is_finite else LANES
-    return max(1, min(together, math.ceil(count / len(jax.local_devices()))))
+    return max(1, min(together, share))
 
 
 def blocks_of(count: int, together: int) -> list[np.ndarray]:

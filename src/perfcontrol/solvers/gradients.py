@@ -19,6 +19,11 @@ class AbstractGradient(eqx.Module):
         """Whether it draws random numbers."""
         return True
 
+    @property
+    def lanes(self) -> int | None:
+        """How many runs a device works on together (`AbstractSolver.lanes`)."""
+        return None
+
     def check(self, problem: PerformativeProblem) -> None:
         """Raise InputError where it does not apply: every problem can be simulated."""
 

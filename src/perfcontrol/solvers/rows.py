@@ -96,8 +96,7 @@ def begin(lanes: int, record: Record | None, shared: Shared, rows: Rows) -> tupl
     return on_devices(one, lanes, shared, rows)
 
 
-@program(on_device=True)
-def advance(
+def _advance(
     lanes: int, record: Record | None, every: int, count: int, shared: Shared, rows: Rows, state: State, first: Array
 ) -> tuple[State, Any]:
     """`count` iterations of every row from iteration `first` on, recorded after each `every`."""
@@ -117,6 +116,10 @@ def advance(
         return jax.lax.cond(runs, lambda: in_lanes(going, shared, work), lambda: in_lanes(ended, shared, work))
 
     return groups_on_devices(group, lanes, (shared, first), (rows, state))
+
+
+advance = program(_advance, on_device=True)
+advance_wide = program(_advance, on_device=True, quick=False)
 
 
 @program(on_device=True)

@@ -115,6 +115,10 @@ class RSGD(AbstractSolver):
     def draws_along(self) -> bool:
         return isinstance(self.gradient, Pathwise)
 
+    @property
+    def lanes(self) -> int | None:
+        return getattr(self.gradient, "lanes", None)
+
     def check(self, problem: PerformativeProblem) -> None:
         self.gradient.check(problem)
         simulated, _ = self._simulated(problem)

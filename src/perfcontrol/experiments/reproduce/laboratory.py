@@ -13,6 +13,7 @@ from perfcontrol.config import REGIMES, ReproduceSettings
 from perfcontrol.experiments.batches import StepRule, in_single_precision
 from perfcontrol.experiments.reproduce.by_stock import CEILING, costs
 from perfcontrol.experiments.reproduce.cases import CASES, Progress, starts_of
+from perfcontrol.experiments.reproduce.path_gradient import StockByStock
 from perfcontrol.experiments.stock import HORIZON, ORDERS
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.random_keys import fast_key
@@ -41,11 +42,12 @@ class Laboratory(NamedTuple):
         says which random numbers each run uses.
         """
         keys = _keys(self.root, stage * 1_000_000 + stream)
-        solvers = [RSGD(1, rule) for rule in rules] if isinstance(rules, list) else RSGD(1, rules)
+        several = isinstance(rules, list)
+        solvers = [RSGD(1, rule, gradient=StockByStock()) for rule in (rules if several else [rules])]
         starts = self.starts[: stream.shape[-1]].reshape(*(1,) * (stream.ndim - 1), -1, *self.starts.shape[1:])
         return solve_many(
             jax.tree.map(lambda leaf: jnp.asarray(leaf[cases]), self.problems),
-            solvers,
+            solvers if several else solvers[0],
             starts,
             keys=keys,
             max_steps=steps,  # so that stages of other lengths need not be compiled anew
