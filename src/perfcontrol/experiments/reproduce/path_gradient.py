@@ -63,11 +63,13 @@ class StockByStock(AbstractGradient):
     def __call__(
         self, problem: PerformativeProblem, M: Array, deployed: Array, key: Key[Array, ""], batch: int
     ) -> Array:
-        law, noise, stocks = problem.perturbation, problem.noise, M.shape[-1]
+        law: Any = problem.perturbation
+        noise: Any = problem.noise
+        persistence: Any = problem.system.A
         market = Market(
-            problem.system.A.values[0],  # type: ignore[union-attr]
+            persistence.values[0],
             law.exposure,
-            problem.initial_state.mean[stocks],
+            problem.initial_state.mean[M.shape[-1]],
             law.growth.rate,
             law.growth.log_sensitivity,
             law.growth.first_moment,
@@ -79,8 +81,8 @@ class StockByStock(AbstractGradient):
         def of_paths(market: Market, M: Array, deployed: Array, key: Array) -> Array:
             if key.ndim:
                 return _gradient(market, M, deployed, key, law.growth.volatility)
-            alone = jax.tree.map(lambda leaf: leaf[..., None], (market, M, deployed, key))
-            return _gradient(*alone, law.growth.volatility)[..., 0]
+            market, M, deployed, key = jax.tree.map(lambda leaf: leaf[..., None], (market, M, deployed, key))
+            return _gradient(market, M, deployed, key, law.growth.volatility)[..., 0]
 
         one = side_by_side(of_paths)
         if batch == 1:
