@@ -213,3 +213,34 @@ def test_two_processes_give_what_one_gives_and_share_a_folder(tmp_path, expected
                 assert_close(answer[name], value, 1e-12)
     assert len(list((tmp_path / "run").glob("runs-*.npz"))) == 2
     assert json.loads((tmp_path / "run/run.json").read_text())["steps"] == 230
+
+
+@pytest.mark.slow
+def test_threads_that_use_all_devices_at_once_do_not_wait_for_one_another():
+    """Four threads, ten calls each, on eight devices: all end, with the same bits."""
+    code = """
+import threading
+import jax
+jax.config.update("jax_num_cpu_devices", 8)
+import numpy as np
+import perfcontrol as pc
+from tests.solvers.problems import performative_prediction
+
+problems, keys = [performative_prediction(0.2), performative_prediction(0.9)], jax.random.split(pc.fast_key(0), 16)
+answers = []
+
+def work():
+    for _ in range(10):
+        answers.append(np.asarray(pc.solve_many(problems, pc.RSGD(120, 0.01), keys=keys).M))
+
+threads = [threading.Thread(target=work) for _ in range(4)]
+for thread in threads:
+    thread.start()
+for thread in threads:
+    thread.join()
+print(len(answers), len({answer.tobytes() for answer in answers}))
+"""
+    run = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=300, check=True
+    )
+    assert run.stdout.split() == ["40", "1"]
