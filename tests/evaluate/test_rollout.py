@@ -60,6 +60,7 @@ def test_same_key_gives_the_same_paths_and_more_samples_keep_the_first():
     other = pc.simulate(c.problem, c.M, deployed=c.deployed, key=jax.random.key(12), samples=3)
     assert_close(again.x, fifty.x, 0, 0)
     assert_close(three.x, fifty.x[:3], 1e-14)
+    assert_close(pc.simulate(c.problem, c.M, deployed=c.deployed, key=KEY).x, fifty.x[:1], 1e-14)
     assert relative_error(other.x, three.x) > 1e-2
 
 
