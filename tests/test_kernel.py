@@ -13,6 +13,7 @@ import pytest
 
 import perfcontrol as pc
 from perfcontrol.evaluate.adjoint import mean_path_gradient
+from perfcontrol.evaluate.paths import lanes
 from perfcontrol.kernel import library
 from perfcontrol.perturbations import redrawn
 from tests.tools import assert_close, assert_refused, normal, random_psd
@@ -98,7 +99,21 @@ CASES = {
 DEFAULT = ("uniform", "gaussian")  # with JAX's default keys, too
 WITH_COST = ("everything varies", "sphere")
 COMPARED = [*CASES, *(f"{name}, default key" for name in DEFAULT), *(f"{name}, cost" for name in WITH_COST)]
+
+
+class LouderDense(pc.DensePerturbation):
+    def sample(self, key, M, horizon):
+        return jax.tree.map(lambda leaf: 2 * leaf, super().sample(key, M, horizon))
+
+
+class DoubledCost(pc.QuadraticCost):
+    def path_cost(self, x, u):
+        return 2 * super().path_cost(x, u)
+
+
 UNSERVED = {
+    "a subclass that draws otherwise": lambda: plain_problem(perturbation=LouderDense(0.1)),
+    "a subclass that costs otherwise": lambda: plain_problem(cost=DoubledCost(np.eye(N), np.eye(INPUTS))),
     "another cost": lambda: plain_problem(cost=pc.ConvexCost(lambda t, x, u: x @ x + u @ u)),
     "on the input": lambda: plain_problem(perturbation=pc.DensePerturbation(0.1, on_input=True)),
     "directions": lambda: plain_problem(perturbation=pc.DirectionalPerturbation(0.1 * normal(16, 2, N, N), np.ones(2))),
@@ -226,6 +241,24 @@ def test_matrices_too_many_to_hold_are_those_that_are_drawn_again(law, kernel, m
     assert np.any(both[1] != np.asarray(pc.sample_gradient(problem, M, deployed=deployed, key=key, samples=9)))
 
 
+def test_matrices_too_many_to_hold_that_the_kernel_does_not_draw_are_left_to_the_package(kernel, monkeypatch):
+    monkeypatch.setattr(redrawn, "HELD", 1)
+    kernel(True)
+    problem = plain_problem("truncated_gaussian")
+    M, deployed = policies(problem)
+    traced = jax.make_jaxpr(lambda M: mean_path_gradient(problem, M, deployed, pc.fast_key(7), 2))(M)
+    assert library.TARGET not in str(traced)
+
+
+@pytest.mark.float32
+def test_kernel_is_given_few_paths_where_they_are_long(kernel):
+    kernel(True)
+    register = 32 // jnp.zeros(()).dtype.itemsize
+    assert lanes(plain_problem(), along=True) == 8 * register
+    assert lanes(plain_problem().truncated(100_000), along=True) == register
+    assert lanes(plain_problem().truncated(1_000_000), along=True) == 1
+
+
 @pytest.mark.parametrize("name", UNSERVED)
 def test_other_problems_are_left_to_the_package(name, kernel):
     kernel(True)
@@ -297,6 +330,21 @@ def test_compiler_that_fails_is_quoted_and_leaves_nothing(fresh, monkeypatch):
     assert_refused(pc.use_kernel, "CXX", "error: no such header", "only slower")
     assert not list((fresh / "cache").rglob("*.so"))
     assert not library.in_use()
+
+
+def test_library_that_does_not_load_is_compiled_again_and_then_told(fresh, monkeypatch):
+    last = 'for last; do :; done; echo called >> "$(dirname "$0")/calls"; echo library > "$last"'
+    monkeypatch.setenv("CXX", script(fresh, last))
+    assert_refused(pc.use_kernel, "PERFCONTROL_CACHE", "library that loads", ".so")
+    assert (fresh / "calls").read_text().count("called") == 2
+
+
+def test_library_that_others_could_have_written_is_not_loaded(fresh, monkeypatch):
+    last = 'for last; do :; done; echo called >> "$(dirname "$0")/calls"; echo library > "$last"'
+    monkeypatch.setenv("CXX", f"{script(fresh, last)} --with option")
+    library.compiled().chmod(0o666)
+    assert library.compiled().stat().st_mode & 0o022 == 0
+    assert (fresh / "calls").read_text().count("called") == 2
 
 
 def test_library_is_compiled_once_and_again_for_another_source(fresh, monkeypatch):

@@ -41,9 +41,10 @@ def by_kernel(
 ) -> Array:
     """`plain(problem, policy, deployed, key)`: the cost of the path that the key draws, or its gradient.
 
-    `policy` and `deployed` are lifted, and so is the gradient. Derivatives are always those of `plain`.
+    `policy` and `deployed` are lifted, and so is the gradient. Derivatives are those of `plain`; there are none by
+    traced numbers that a plain function inside of the problem closes over.
     """
-    if not serves(problem) or policy.dtype != problem.dtype:
+    if not serves(problem) or policy.dtype != problem.dtype or _is_redrawn(problem, deployed, key):
         return plain(problem, policy, deployed, key)
     dynamic, static = eqx.partition((problem, policy, deployed, key), eqx.is_array)
 
@@ -58,10 +59,23 @@ def by_kernel(
 
 def serves(problem: PerformativeProblem) -> bool:
     """Whether the kernel is switched on, and knows problems of this kind."""
-    perturbation, n = problem.perturbation, problem.state_size
-    dense = isinstance(perturbation, DensePerturbation) and perturbation.columns(n, problem.input_size) == n
-    known = (dense or isinstance(perturbation, NoPerturbation)) and isinstance(problem.cost, QuadraticCost)
+    law = type(problem.perturbation)  # a subclass may draw, or cost, otherwise
+    on_state = problem.perturbation.columns(problem.state_size, problem.input_size) == problem.state_size
+    known = law in (DensePerturbation, NoPerturbation) and on_state and type(problem.cost) is QuadraticCost
     return in_use() and known and problem.dtype in (np.float32, np.float64)
+
+
+def _is_redrawn(problem: PerformativeProblem, deployed: Array, key: Key[Array, ""]) -> bool:
+    """Whether matrices are too many to be held, and are none that the kernel draws itself."""
+    if not isinstance(problem.perturbation, DensePerturbation):
+        return False
+    draws = eqx.filter_eval_shape(lambda: _drawn(problem, deployed, key))
+    return not isinstance(draws, Counted | WhiteDraws | DenseDraws)
+
+
+def _drawn(problem: PerformativeProblem, deployed: Array, key: Key[Array, ""]) -> Any:
+    counted = problem.perturbation.counted(key, deployed, problem.horizon)  # type: ignore[attr-defined]
+    return problem.perturbation.sample_along(key, deployed, problem.horizon) if counted is None else counted
 
 
 def _called(problem: PerformativeProblem, policy: Array, deployed: Array, key: Key[Array, ""], gradient: bool) -> Array:
@@ -91,19 +105,14 @@ def _called(problem: PerformativeProblem, policy: Array, deployed: Array, key: K
 
 
 def _reaction(problem: PerformativeProblem, deployed: Array, key: Key[Array, ""]) -> _Reaction:
-    perturbation, horizon = problem.perturbation, problem.horizon
     nothing = jnp.zeros(4, np.uint32)
-    if not isinstance(perturbation, DensePerturbation):
+    if not isinstance(problem.perturbation, DensePerturbation):
         return _Reaction(NONE, nothing)
-    counted = perturbation.counted(key, deployed, horizon)
-    if isinstance(counted, Counted):
-        kind = SIGNS if counted.signs else UNIFORM
-        words = jax.random.key_data(counted.key)
-        return _Reaction(kind, words, counted.scale, counted.location, each=counted.each)
-    draws = perturbation.sample_along(key, deployed, horizon)
-    if isinstance(draws, WhiteDraws):
-        return _Reaction(
-            PRODUCTS, nothing, draws.scale, draws.location, ahead=draws.ahead, back=draws.back, rest=draws.rest
-        )
-    matrices = draws.matrices if isinstance(draws, DenseDraws) else draws.dense()  # type: ignore[attr-defined]
-    return _Reaction(MATRICES, nothing, jnp.ones(1, deployed.dtype), matrices=matrices)
+    drawn = _drawn(problem, deployed, key)
+    if isinstance(drawn, Counted):
+        kind = SIGNS if drawn.signs else UNIFORM
+        return _Reaction(kind, jax.random.key_data(drawn.key), drawn.scale, drawn.location, each=drawn.each)
+    if isinstance(drawn, WhiteDraws):
+        products = {"ahead": drawn.ahead, "back": drawn.back, "rest": drawn.rest}
+        return _Reaction(PRODUCTS, nothing, drawn.scale, drawn.location, **products)
+    return _Reaction(MATRICES, nothing, jnp.ones(1, deployed.dtype), matrices=drawn.matrices)

@@ -4,8 +4,10 @@ import ctypes
 import hashlib
 import os
 import platform
+import shlex
 import shutil
 import subprocess
+import threading
 from pathlib import Path
 
 import jax
@@ -26,6 +28,7 @@ WAIT = 300  # seconds that a compiler may take
 class _Switch:
     on = False
     loaded = False
+    lock = threading.Lock()
 
 
 def in_use() -> bool:
@@ -54,26 +57,38 @@ def use_kernel(on: bool = True) -> None:
     """
     if not isinstance(on, bool):
         raise fail("on", repr(on), "be True or False", "Write pc.use_kernel() or pc.use_kernel(False).")
-    if on and not _Switch.loaded:
-        library = ctypes.CDLL(str(compiled()))
-        jax.ffi.register_ffi_target(TARGET, jax.ffi.pycapsule(library.PerfcontrolPaths), platform="cpu")
-        _Switch.loaded = True
-    if on != _Switch.on:
-        _Switch.on = on
-        jax.clear_caches()
+    with _Switch.lock:
+        if on and not _Switch.loaded:
+            jax.ffi.register_ffi_target(TARGET, jax.ffi.pycapsule(_loaded().PerfcontrolPaths), platform="cpu")
+            _Switch.loaded = True
+        if on != _Switch.on:
+            _Switch.on = on
+            jax.clear_caches()
 
 
-def _compiler() -> str:
+def _loaded() -> ctypes.CDLL:
+    """The library; compiled once more where what was kept does not load."""
+    try:
+        return ctypes.CDLL(str(compiled()))
+    except OSError:
+        compiled().unlink(missing_ok=True)
+    library = compiled()
+    try:
+        return ctypes.CDLL(str(library))
+    except OSError as error:
+        remedy = "Keep it elsewhere: set PERFCONTROL_CACHE to a folder from which programs may be loaded."
+        raise fail("PERFCONTROL_CACHE", str(error), "hold a library that loads", remedy) from error
+
+
+def _compiler() -> list[str]:
     """The command of a C++ compiler: $CXX, or the first of `COMPILERS` there is."""
     named = os.environ.get("CXX")
-    for command in (named,) if named else COMPILERS:
-        found = shutil.which(command)
+    for command in [shlex.split(named)] if named else [[name] for name in COMPILERS]:
+        found = shutil.which(command[0]) if command else None
         if found:
-            return found
-    required = "find a compiler of C++17 on this machine"
-    raise fail(
-        "CXX", named or f"none of {', '.join(COMPILERS)}", required, "Install one, such as g++, or name it: CXX."
-    )
+            return [found, *command[1:]]
+    got = named or f"none of {', '.join(COMPILERS)}"
+    raise fail("CXX", got, "name a C++17 compiler of this machine", "Install one, such as g++, or set CXX to its path.")
 
 
 def _processor() -> str:
@@ -83,27 +98,36 @@ def _processor() -> str:
     return next((line for line in lines if line.startswith("flags")), f"{platform.node()} {platform.processor()}")
 
 
+def _is_own(library: Path) -> bool:
+    """Whether the file is there and nobody else could have written it: what is loaded is executed."""
+    if not library.exists():
+        return False
+    about = library.stat()
+    return os.name != "posix" or (about.st_uid == os.geteuid() and not about.st_mode & 0o022)
+
+
 def compiled() -> Path:
-    """The library, compiled unless that was done before for the same source, compiler, JAX and processor."""
+    """The library, compiled unless that was done before for the same source, compiler, JAX and machine."""
     compiler = _compiler()
-    made_of = [compiler, *FLAGS, FOR_THIS_PROCESSOR, jaxlib.__version__, platform.machine(), _processor()]
+    machine = [platform.system(), platform.machine(), *platform.libc_ver(), _processor()]
+    made_of = [*compiler, *FLAGS, FOR_THIS_PROCESSOR, jaxlib.__version__, *machine]
     digest = hashlib.sha256("\n".join(made_of).encode())
     for source in sorted(SOURCES.iterdir()):
         digest.update(source.read_bytes())
     library = cache_folder() / "kernel" / f"{digest.hexdigest()[:32]}.so"
-    if not library.exists():
+    if not _is_own(library):
         with written_whole(library) as made:
-            said = _errors(compiler, FOR_THIS_PROCESSOR, made) and _errors(compiler, None, made)
+            said = _errors(compiler, [FOR_THIS_PROCESSOR], made) and _errors(compiler, [], made)
             if said:
                 remedy = "Name another compiler: CXX=g++. Without the kernel everything works as well, only slower."
-                raise fail("CXX", f"{compiler}, which said: {said}", "compile the kernel (C++17)", remedy)
+                raise fail("CXX", f"{' '.join(compiler)}, which said: {said}", "compile the kernel (C++17)", remedy)
     return library
 
 
-def _errors(compiler: str, extra: str | None, library: Path) -> str:
+def _errors(compiler: list[str], extra: list[str], library: Path) -> str:
     """Compile; what went wrong, in a line, or nothing."""
-    flags = [*FLAGS, *([extra] if extra else []), f"-I{SOURCES}", "-isystem", jax.ffi.include_dir()]
-    command = [compiler, *flags, str(SOURCES / "paths.cc"), "-o", str(library)]
+    flags = [*FLAGS, *extra, f"-I{SOURCES}", "-isystem", jax.ffi.include_dir()]
+    command = [*compiler, *flags, str(SOURCES / "paths.cc"), "-o", str(library)]
     try:
         run = subprocess.run(command, capture_output=True, text=True, timeout=WAIT)
     except (OSError, subprocess.TimeoutExpired) as error:

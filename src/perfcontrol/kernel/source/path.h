@@ -26,7 +26,8 @@ class Path {
         A_(n_, n_, false), B_(n_, m_, false), K_(m_, n_, false), Q_(n_, n_, false), R_(m_, m_, false),
         N_(n_, m_, false), AT_(n_, n_, true), BT_(n_, m_, true), KT_(m_, n_, true), NT_(n_, m_, true),
         location_(n_, n_, false), locationT_(n_, n_, true), M_(memory_, Matrix<T, kTogether>(m_, n_, false)),
-        x_((horizon_ + 1) * pn_), by_x_(x_.size()), w_(x_.size()), by_u_((horizon_ + 1) * pm_), u_(pm_), du_(pm_),
+        x_((horizon_ + 1) * pn_), by_x_((gradient ? horizon_ + 1 : 1) * pn_), w_(x_.size()),
+        by_u_((gradient ? horizon_ + 1 : 1) * pm_), kept_(gradient), u_(pm_), du_(pm_),
         dx_(pn_), y_(pn_), now_(pn_), unit_(pn_), to_policy_(memory_ * m_ * pn_) {
     const bool drawn = reaction == kSigns || reaction == kUniform;
     held_ = drawn && gradient && horizon_ * n_ * pn_ * sizeof(Number) <= kHeld;
@@ -40,7 +41,7 @@ class Path {
     for (size_t i = 0; i < n_; ++i) x_[i] = g.x0.At(0, i);
     for (size_t t = 0; t <= horizon_; ++t) {
       const Number* x = &x_[t * pn_];
-      Number *by_x = &by_x_[t * pn_], *by_u = &by_u_[t * pm_], *u = u_.data();
+      Number *by_x = &by_x_[kept_ * t * pn_], *by_u = &by_u_[kept_ * t * pm_], *u = u_.data();
       std::fill(u_.begin(), u_.end(), Number{});
       for (size_t lag = 1; lag <= std::min(t, memory_); ++lag) {
         M_[lag - 1].AddTo(g.M, 0, &w_[(t - lag) * pn_], u, 1, (lag - 1) * m_ * n_);
@@ -171,7 +172,9 @@ class Path {
   bool redrawn_, held_ = false;
   Matrix<T, kTogether> A_, B_, K_, Q_, R_, N_, AT_, BT_, KT_, NT_, location_, locationT_;
   std::vector<Matrix<T, kTogether>> M_;
-  std::vector<Number> x_, by_x_, w_, by_u_, u_, du_, dx_, y_, now_, unit_, to_policy_, Z_;
+  std::vector<Number> x_, by_x_, w_, by_u_;
+  size_t kept_;  // 1 where the gradients of all stages are, for the way back; else 0
+  std::vector<Number> u_, du_, dx_, y_, now_, unit_, to_policy_, Z_;
   std::vector<T> flat_;
 };
 

@@ -2,6 +2,7 @@
 //
 // The same numbers, to rounding, as `sample_along` and `path_gradient` give for the same key.
 
+#include <new>
 #include <vector>
 
 #include "arguments.h"
@@ -85,10 +86,14 @@ ffi::Error Paths(ffi::RemainingArgs buffers, Answer cost, Answer gradients, int6
     arguments.emplace_back(*buffer, kInner[i], i == kKey ? 4 : ffi::ByteWidth(type), kTimed[i]);
   }
   const Work work{arguments, axes, sizes, static_cast<Reaction>(reaction), redrawn, gradient};
-  if (type == ffi::DataType::F32) {
-    RunAll<float>(work, cost, gradients);
-  } else {
-    RunAll<double>(work, cost, gradients);
+  try {
+    if (type == ffi::DataType::F32) {
+      RunAll<float>(work, cost, gradients);
+    } else {
+      RunAll<double>(work, cost, gradients);
+    }
+  } catch (const std::bad_alloc&) {
+    return ffi::Error(ffi::ErrorCode::kResourceExhausted, "there is not memory enough for these paths");
   }
   return ffi::Error::Success();
 }
