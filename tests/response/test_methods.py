@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import perfcontrol as pc
-from perfcontrol.evaluate.cost_to_go import world_of
+from perfcontrol.evaluate.world import world_of
 from perfcontrol.response.methods import method_of, shape_of_cost
 from perfcontrol.response.projected import Projected, ProjectedByFactors
 from perfcontrol.response.quadratic import Factors, Quadratic, factors, quadratic, stationary

@@ -37,6 +37,38 @@ class TestStablePoint(SolverContract):
             assert bool(solution.stats["unique"])
 
 
+# --- the first steps ----------------------------------------------------------------------------------------------
+
+
+def weakly_reacting(slope: float) -> pc.PerformativeProblem:
+    A, B, directions = 0.4 * normal(1, 3, 3), normal(2, 3, 2), 0.2 * normal(3, 2, 3, 3)
+    return pc.PerformativeProblem(
+        system=pc.LinearSystem(A, B),
+        horizon=12,
+        memory=2,
+        noise=pc.Rademacher(np.ones(3)),
+        cost=pc.QuadraticCost(np.eye(3), np.eye(2)),
+        perturbation=pc.DirectionalPerturbation(directions, lambda M: slope * (1 + jnp.sum(M**2)) * jnp.ones(2)),
+    )
+
+
+@pytest.mark.parametrize("slope", [0.3, 1.0])
+@pytest.mark.parametrize("max_steps", [None, 3])
+def test_first_steps_in_one_program_are_those_that_follow_one_another(slope, max_steps, monkeypatch):
+    problem = weakly_reacting(slope)
+
+    def run():
+        return pc.solve(problem, SOLVER, max_steps=max_steps, record=jnp.sum, every=2, throw=False)
+
+    together = run()
+    monkeypatch.setattr(pc.StablePoint, "opening", lambda *_: None)
+    apart = run()
+    assert int(together.steps) == int(apart.steps) and together.result == apart.result
+    assert_close(together.history, apart.history, 1e-11)
+    assert_close(together.M, apart.M, 1e-11)
+    assert abs(float(together.stats["residual"]) - float(apart.stats["residual"])) <= 1e-13
+
+
 # --- beyond repeated minimisation ------------------------------------------------------------------------------------
 
 

@@ -15,9 +15,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from perfcontrol._linalg import Matrix, along_time, congruence, symmetrise, transpose
-from perfcontrol._programs import program
+from perfcontrol.evaluate.impulse_form import ImpulseForm
 from perfcontrol.evaluate.loop import closed_loop
-from perfcontrol.evaluate.stationary import StationaryWorld, stationary_world
+from perfcontrol.evaluate.stationary import StationaryWorld
 from perfcontrol.problem import PerformativeProblem
 
 
@@ -39,6 +39,7 @@ class CostToGo(eqx.Module):
     B: Matrix
     noise_mean: Float[Array, "*time n"]
     noise_covariance: Float[Array, "*times n n"]
+    impulses: ImpulseForm | None = None
 
     @property
     def S(self) -> Float[Array, "T1 m m"]:
@@ -90,10 +91,3 @@ def cost_to_go(problem: PerformativeProblem, reacting: Array) -> CostToGo:
 
 
 World = CostToGo | StationaryWorld
-
-
-@program(on_device=True)  # what works with it are programs, too
-def world_of(problem: PerformativeProblem, deployed: Any) -> World:
-    """The world that the deployed policy's free parameters make: `cost_to_go`, or its stationary limit."""
-    make = cost_to_go if problem.is_finite else stationary_world
-    return make(problem, problem.structure.lift(deployed))

@@ -14,12 +14,13 @@ from jaxtyping import Array
 from perfcontrol._checks import check_finite, fail
 from perfcontrol._linalg import along_time, symmetrise
 from perfcontrol._programs import known, program
-from perfcontrol.evaluate.cost_to_go import World, world_of
+from perfcontrol.evaluate.cost_to_go import World
 from perfcontrol.evaluate.impulses import constant_impulses, varying_impulses
 from perfcontrol.evaluate.loop import require_moments
 from perfcontrol.evaluate.mean_path import mean_path
 from perfcontrol.evaluate.rollout import check_pair
 from perfcontrol.evaluate.stationary import StationaryWorld, mean_square_radius, mean_stage
+from perfcontrol.evaluate.world import world_of
 from perfcontrol.policy import feedforward, feedforward_adjoint
 from perfcontrol.problem import PerformativeProblem
 

@@ -3,25 +3,16 @@
 Nothing is quadratic in the horizon: where F and B are constant the sums over time are taken before the products.
 """
 
-import equinox as eqx
+import dataclasses
+
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from perfcontrol._linalg import Matrix, along_time, as_dense, transpose
 from perfcontrol.evaluate.cost_to_go import CostToGo, World
+from perfcontrol.evaluate.impulse_form import ImpulseForm
 from perfcontrol.evaluate.stationary import StationaryWorld
-
-
-class ImpulseForm(eqx.Module):
-    """Σ_s of the quadratic forms that impulses w_s meet, for noise whose covariance is constant; of one in the limit.
-
-    G: (H m, H m), F: (H m, n), a: (n, n): cost tr Σ (a + FᵀM̂ + M̂ᵀF + M̂ᵀG M̂), M̂ the (H m, n) stack of lags.
-    """
-
-    G: Float[Array, "Hm Hm"]
-    F: Float[Array, "Hm n"]
-    a: Float[Array, "n n"]
 
 
 def _chains(world: CostToGo, memory: int) -> tuple[list[Array], list[Array]]:
@@ -75,8 +66,17 @@ def _chain_tails(world: CostToGo, memory: int) -> tuple[Array, Array]:
     return jnp.stack(X), jnp.stack([y[0] for y in Y])
 
 
+def with_impulses(world: World, memory: int) -> World:
+    """The world with its impulse form, where it has one: where the noise covariance is constant."""
+    if world.noise_covariance.ndim == 3:
+        return world
+    return dataclasses.replace(world, impulses=impulse_form(world, memory))
+
+
 def impulse_form(world: World, memory: int) -> ImpulseForm:
     """The blocks summed over impulses, by tail sums over time; in the stationary limit those of one impulse."""
+    if world.impulses is not None:
+        return world.impulses
     m = world.B.shape[-1]
     if isinstance(world, StationaryWorld):
         (X, Y), a = world.chains(memory), world.Lambda

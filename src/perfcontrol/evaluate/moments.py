@@ -15,10 +15,10 @@ from jaxtyping import Array, Float
 from perfcontrol._checks import check_finite
 from perfcontrol._linalg import along_time, as_dense, symmetrise
 from perfcontrol._programs import program
-from perfcontrol.evaluate.cost_to_go import world_of
 from perfcontrol.evaluate.exact import check_digits
 from perfcontrol.evaluate.loop import known_covariance, require_moments
 from perfcontrol.evaluate.rollout import check_pair
+from perfcontrol.evaluate.world import world_of
 from perfcontrol.policy import lagged
 from perfcontrol.problem import PerformativeProblem, check_end
 

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 from perfcontrol._linalg import Matrix, as_dense, congruence, matvec, rmatvec, symmetrise, transpose
 from perfcontrol._programs import program
 from perfcontrol.costs import QuadraticCost
+from perfcontrol.evaluate.impulse_form import ImpulseForm
 from perfcontrol.evaluate.loop import Loop, closed_loop
 from perfcontrol.evaluate.lyapunov import Operator, is_stable, solve_fixed_point, spectral_radius
 from perfcontrol.problem import PerformativeProblem
@@ -26,7 +27,7 @@ class StationaryWorld(eqx.Module):
 
     Lambda: (n, n) cost-to-go. Q (n, n), N (m, n), R (m, m): what a stage with given means of x and v costs, the
     multiplicative noise that these excite included. F: (n, n) mean closed loop, B: (n, m) mean input matrix, Θ
-    included. noise_mean: (n,) and noise_covariance: (n, n), of the law of w_t.
+    included. noise_mean: (n,) and noise_covariance: (n, n), of the law of w_t. impulses: None if not computed yet.
     """
 
     Lambda: Float[Array, "n n"]
@@ -37,6 +38,7 @@ class StationaryWorld(eqx.Module):
     B: Matrix
     noise_mean: Float[Array, " n"]
     noise_covariance: Float[Array, "n n"]
+    impulses: ImpulseForm | None = None
 
     @property
     def S(self) -> Array:

@@ -37,7 +37,7 @@ class Affine:
         xp, _ = numerics(form.matrix)
         matrix = form.matrix
         assert matrix is not None
-        self.form = form
+        self.form, self.step = form, form.step
         if isinstance(feasible_set, Unconstrained):
             self.origin = xp.zeros(form.linear.shape, form.linear.dtype)
             self.inverse, rank = pseudo_inverse(matrix, 1 / form.step)
@@ -72,7 +72,8 @@ class AffineByProducts:
     """The same by conjugate gradients, for Hessians too large to hold; started at zero, they find the least norm."""
 
     def __init__(self, feasible_set: AbstractSet, form: Quadratic):
-        self.form, self.origin = form, feasible_set.project(jnp.zeros_like(form.linear))
+        self.form, self.step = form, form.step
+        self.origin = feasible_set.project(jnp.zeros_like(form.linear))
         self.project = feasible_set.project
 
     def _tangent(self, V: Array) -> Array:

@@ -18,7 +18,8 @@ Method = Affine | AffineByProducts | Projected | ProjectedByFactors | Separable
 
 def is_held(problem: PerformativeProblem) -> bool:
     """Whether the Hessian is held as a matrix."""
-    return math.prod(problem.policy_shape) <= quadratics.DENSE_LIMIT
+    full = isinstance(problem.structure, FullStructure)
+    return math.prod(problem.lifted_shape if full else problem.policy_shape) <= quadratics.DENSE_LIMIT
 
 
 def is_free(problem: PerformativeProblem) -> bool:

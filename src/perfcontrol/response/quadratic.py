@@ -52,7 +52,8 @@ def stationary(world: World) -> bool:
 class Factors(NamedTuple):
     """The same quadratic for constant noise moments: gradient(M̂) = linear + 2 (G M̂ Σ + G̃ M̂ w̄w̄ᵀ), lifted.
 
-    linear: policy shape. G, G_mean: G and G̃, (H m, H m). Sigma, w: covariance and mean of the noise.
+    linear: policy shape. G, G_mean: G and G̃, (H m, H m). Sigma, w: covariance and mean of the noise. G_mean and w are
+    None where the mean is zero.
     """
 
     linear: Any
@@ -65,25 +66,27 @@ class Factors(NamedTuple):
     def matrix(self) -> Any:
         """𝐇, (p, p)."""
         xp, _ = numerics(self.G, self.Sigma)
-        return 2 * (xp.kron(self.G, self.Sigma) + xp.kron(self.G_mean, xp.outer(self.w, self.w)))
+        matrix = xp.kron(self.G, self.Sigma)
+        return 2 * (matrix if self.w is None else matrix + xp.kron(self.G_mean, xp.outer(self.w, self.w)))
 
     def gradient(self, M: Any) -> Any:
         """The gradient at M."""
         stacked = M.reshape(-1, M.shape[-1])
-        by_mean = (self.G_mean @ (stacked @ self.w))[:, None] * self.w
-        return self.linear + 2 * (self.G @ stacked @ self.Sigma + by_mean).reshape(M.shape)
+        curved = self.G @ stacked @ self.Sigma
+        if self.w is not None:
+            curved = curved + (self.G_mean @ (stacked @ self.w))[:, None] * self.w
+        return self.linear + 2 * curved.reshape(M.shape)
 
 
 _impulse_form, _sustained_form = program(impulse_form), program(sustained_form)
 
 
-def factors(problem: PerformativeProblem, world: World) -> Factors:
-    """The factors of a given world."""
-    form = _impulse_form(world, problem.memory)
-    Sigma, w = on_host((world.noise_covariance, world.noise_mean))
-    if known(w) and not np.any(w):  # nothing has a mean that the policy could act on
-        linear = 2 * (form.F @ Sigma).reshape(problem.lifted_shape)
-        return Factors(linear, form.G, numerics(form.G)[0].zeros_like(form.G), Sigma, w)
+def factors(problem: PerformativeProblem, world: World, centred: bool = False) -> Factors:
+    """The factors of a given world; `centred`: the mean of the noise is known to be zero."""
+    form = _impulse_form(world, problem.memory) if world.impulses is None else world.impulses
+    form, Sigma, w = on_host((form, world.noise_covariance, world.noise_mean))
+    if centred or (known(w) and not np.any(w)):  # nothing has a mean that the policy could act on
+        return Factors(2 * (form.F @ Sigma).reshape(problem.lifted_shape), form.G, None, Sigma, None)
     linear = weigh(problem, world, np.zeros(problem.policy_shape, world.Lambda.dtype))[1]
     return Factors(linear, form.G, _sustained_form(world, problem.memory), Sigma, w)
 

@@ -6,6 +6,8 @@ numbers; the derivative of Φ comes from one Newton step at the minimiser (impli
 differentiating a loop.
 """
 
+import functools
+import operator
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -15,11 +17,12 @@ from jaxtyping import Array
 
 from perfcontrol._linalg import frobenius
 from perfcontrol._programs import known, numerics, on_host, program
-from perfcontrol.evaluate.cost_to_go import World, world_of
+from perfcontrol.evaluate.cost_to_go import World
 from perfcontrol.evaluate.exact import check_answer, exact_gradient, expected_gradient, weigh
 from perfcontrol.evaluate.loop import require_moments
 from perfcontrol.evaluate.reaction import reaction_jacobian
 from perfcontrol.evaluate.rollout import check_pair
+from perfcontrol.evaluate.world import world_of
 from perfcontrol.problem import PerformativeProblem, check_problem
 from perfcontrol.response.affine import AffineByProducts
 from perfcontrol.response.estimate import SampleAverage, estimate_response, is_exact
@@ -30,11 +33,15 @@ from perfcontrol.response.sampled import Sampled, approach, minimise, sampled_ja
 
 
 class Response(NamedTuple):
-    """A best response M (of least norm on affine sets; NaN where the world overflows), and whether it is the only
-    one."""
+    """A best response.
+
+    M: of least norm on affine sets; NaN where the world overflows. unique: whether it is the only one. residual: of the
+    deployed policy itself, as `natural_residual` without a pass over time of its own; None where responses are sampled.
+    """
 
     M: Any
     unique: Any
+    residual: Any = None
 
 
 def _on_host(problem: PerformativeProblem, deployed: Any, *others: Any) -> bool:
@@ -44,26 +51,37 @@ def _on_host(problem: PerformativeProblem, deployed: Any, *others: Any) -> bool:
     return is_held(problem) or (is_free(problem) and stationary(jax.eval_shape(world_of, problem, deployed)))
 
 
-def _sound(form: Any) -> Any:
+def is_sound(form: Any) -> Any:
+    """Whether all numbers are finite."""
     xp, _ = numerics(form)
-    leaves = [leaf for leaf in jax.tree.leaves(form) if not callable(leaf)]
-    return xp.all(xp.stack([xp.all(xp.isfinite(leaf)) for leaf in leaves]))
+    finite = [xp.all(xp.isfinite(leaf)) for leaf in jax.tree.leaves(form) if not callable(leaf)]
+    return functools.reduce(operator.and_, finite)
 
 
 def _respond(problem: PerformativeProblem, deployed: Any, start: Any, inner_steps: int | None) -> Response:
     world = world_of(problem, deployed)
     form = shape_of_cost(problem, world)
     xp, _ = numerics(form, start)
-    sound = _sound(form)
+    sound = is_sound(form)
     if known(sound) and not sound:
-        return Response(xp.full_like(start, xp.nan), xp.asarray(False))
+        return Response(xp.full_like(start, xp.nan), xp.asarray(False), xp.asarray(xp.inf, start.dtype))
     if inner_steps is None:
-        M, unique = method_of(problem, world, form).minimise(start)
+        method = method_of(problem, world, form)
+        step, (M, unique) = method.step, method.minimise(start)
     else:
         step = step_length(problem, world, form)
         M, unique = gradient_steps(problem.feasible_set, form.gradient, step, start, inner_steps), xp.asarray(True)
+    residual = moved_by(problem, form, step, deployed, form.gradient(deployed))
     # Pseudo-inverses turn an overflow into finite nonsense: no number at all is the honest answer.
-    return Response(xp.where(sound, M, xp.nan), unique)
+    return Response(xp.where(sound, M, xp.nan), unique, xp.where(sound, residual, xp.inf))
+
+
+def moved_by(problem: PerformativeProblem, form: Any, step: Any, M: Any, gradient: Any) -> Any:
+    """‖M - Proj(M - step·gradient)‖_F relative to ‖M‖_F + step ‖linear‖_F."""
+    moved = frobenius(M - nearest(problem.feasible_set, M - step * gradient))
+    scale = frobenius(M) + frobenius(step * form.linear)
+    xp, _ = numerics(scale)
+    return moved / xp.where(scale > 0, scale, 1)
 
 
 _respond_in_one_program = program(_respond)
@@ -135,19 +153,16 @@ def natural_residual(problem: PerformativeProblem, M: Any, deployed: Any, gradie
     form = shape_of_cost(problem, world)
     xp, _ = numerics(form, M)
     at_M = weigh(problem, world, M)[1] if gradient is None else gradient
-    sound = _sound((form, at_M))
+    sound = is_sound((form, at_M))
     if known(sound) and not sound:
         return xp.asarray(xp.inf, at_M.dtype)
-    step = step_length(problem, world, form)
-    moved = frobenius(M - nearest(problem.feasible_set, M - step * at_M))
-    scale = frobenius(M) + frobenius(step * form.linear)
-    return xp.where(sound, moved / xp.where(scale > 0, scale, 1), xp.inf)
+    return xp.where(sound, moved_by(problem, form, step_length(problem, world, form), M, at_M), xp.inf)
 
 
 def _step_at(problem: PerformativeProblem, deployed: Any) -> Any:
     world = world_of(problem, deployed)
     form = shape_of_cost(problem, world)
-    sound = _sound(form)
+    sound = is_sound(form)
     if known(sound) and not sound:
         return np.asarray(np.nan, problem.dtype)
     return step_length(problem, world, form)

@@ -1,13 +1,13 @@
 """Best response without constraint, structure or change in the noise: the Hessian is 2 (G ⊗ Σ + G̃ ⊗ w̄w̄ᵀ).
 
-With a = Σ^{-1/2} w̄ and Y = M̂ Σ^{1/2}: the part of Y across a meets G alone, the part along a G + |a|² G̃: two solves
-with H m unknowns. Where G or Σ is singular, the dense method serves.
+With u = Σ⁻¹w̄ and s = w̄ᵀu, M̂ = Y + y uᵀ/s where Y w̄ = 0: Y, what does not meet the mean, needs G alone, and y = M̂ w̄
+needs G + s G̃: two solves with H m unknowns. Where G or Σ is singular, the dense method serves.
 """
 
 from collections.abc import Callable
 from typing import Any
 
-from perfcontrol._programs import cond, known, numerics
+from perfcontrol._programs import cond, numerics
 from perfcontrol.response.definite import Definite
 from perfcontrol.response.quadratic import Factors, Operator
 
@@ -22,36 +22,31 @@ class Separable:
     def __init__(self, factors: Factors, dense: Callable[[], Any]):
         self.factors, self.dense = factors, dense
         xp, self.linalg = numerics(factors)
-        _, G, G_mean, Sigma, w = factors
-        self.shape = H, m, n = factors.linear.shape
-        eps, tiny = xp.finfo(G.dtype).eps, xp.finfo(G.dtype).tiny
-        self.G = Definite(G)
-        S_values, S_vectors = xp.linalg.eigh(Sigma)
-        self.regular = self.G.regular & (S_values[0] > n * eps * S_values[-1])
-        largest = 2 * (self.G.largest * S_values[-1] + xp.linalg.norm(G_mean) * (w @ w))
-        self.step = 1 / xp.maximum(largest, tiny)
-        self.inverse_root = (S_vectors / xp.sqrt(xp.where(S_values > 0, S_values, 1))) @ S_vectors.T
-        self.centred = known(w) and not xp.any(w)
-        a = self.inverse_root @ w
-        squared = a @ a
-        self.unit = a / xp.sqrt(xp.where(squared > 0, squared, 1))
-        if not self.centred:
-            shift = xp.where(self.regular, 0, 1).astype(G.dtype) * xp.eye(H * m, dtype=G.dtype)
+        linear, G, G_mean, Sigma, w = factors
+        self.shape = linear.shape
+        self.G, self.Sigma = Definite(G), Definite(Sigma)
+        self.regular = self.G.regular & self.Sigma.regular
+        largest = self.G.largest * self.Sigma.largest
+        if w is not None:
+            largest = largest + xp.linalg.norm(G_mean) * (w @ w)
+            u = self.Sigma.solve(w[:, None])[:, 0]
+            squared = w @ u
+            self.unit = u / xp.where(squared > 0, squared, 1)
+            shift = xp.where(self.regular, 0, 1).astype(G.dtype) * xp.eye(len(G), dtype=G.dtype)
             self.along = G + squared * G_mean + shift
+        self.step = 1 / xp.maximum(2 * largest, xp.finfo(G.dtype).tiny)
 
     def _separately(self, gradients: Any) -> Any:
         """Newton steps for gradients (k, H, m, n)."""
-        H, m, n = self.shape
-        right = -gradients.reshape(-1, H * m, n) @ self.inverse_root / 2
-        if self.centred:
-            return (self.G.solve(right) @ self.inverse_root).reshape(gradients.shape)
-        mean_part = right @ self.unit  # (k, Hm)
-        across = right - mean_part[..., None] * self.unit
-        Y = self.G.solve(across)
+        right = gradients.reshape(-1, len(self.factors.G), self.shape[-1]) / -2
+        right = self.Sigma.solve(right.swapaxes(-1, -2)).swapaxes(-1, -2)
+        if self.factors.w is None:
+            return self.G.solve(right).reshape(gradients.shape)
+        mean_part = right @ self.factors.w  # (k, Hm)
+        across = self.G.solve(right - mean_part[..., None] * self.unit)
         factor = self.linalg.cho_factor(self.along, lower=True)
         along = self.linalg.cho_solve(factor, mean_part.T).T
-        Y = Y + (along - Y @ self.unit)[..., None] * self.unit
-        return (Y @ self.inverse_root).reshape(gradients.shape)
+        return (across + along[..., None] * self.unit).reshape(gradients.shape)
 
     def solve(self, gradient: Any) -> Any:
         """The Newton step for a gradient, or for each of several along the first axis."""
@@ -61,13 +56,12 @@ class Separable:
 
     def minimise(self, start: Any) -> tuple[Any, Any]:
         """The minimiser (of least norm), and whether it is the only one."""
+        return cond(self.regular, lambda: (self.only(), self.regular), lambda: self.dense().minimise(start))
 
-        def regular() -> tuple[Any, Any]:
-            M = self._separately(self.factors.linear[None])[0]
-            M = M + self._separately(self.factors.gradient(M)[None])[0]  # one step of iterative refinement
-            return M, self.regular
-
-        return cond(self.regular, regular, lambda: self.dense().minimise(start))
+    def only(self) -> Any:
+        """The minimiser where the factors are regular."""
+        M = self._separately(self.factors.linear[None])[0]
+        return M + self._separately(self.factors.gradient(M)[None])[0]  # one step of iterative refinement
 
     def newton(self, M: Any) -> Operator:
         """gradient -> the Newton step from near the minimiser M."""

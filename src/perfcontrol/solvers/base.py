@@ -1,7 +1,7 @@
 """The interface of a solver: `init`, `step`, `finish` on a state that every solver carries; what a run returns."""
 
 import abc
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -25,7 +25,7 @@ class SolveError(RuntimeError):
         self.solution = solution
 
 
-class State(eqx.Module):
+class State(NamedTuple):
     """What every solver carries: the iterate, the number of steps taken, how the run stands, the solver's own."""
 
     M: Numbers
@@ -81,6 +81,10 @@ class AbstractSolver(eqx.Module):
     @abc.abstractmethod
     def step(self, problem: PerformativeProblem, state: State, key: Any) -> State:
         """One iteration; `key` is that iteration's own."""
+
+    def opening(self, problem: PerformativeProblem, state: State, count: int) -> tuple[State, Any] | None:
+        """The first steps, `count` at most, by one program, and the policies after each; None: one after the other."""
+        return None
 
     @abc.abstractmethod
     def finish(self, problem: PerformativeProblem, state: State, stopped: bool) -> tuple[Result, dict[str, Any]]:

@@ -11,7 +11,6 @@ A border is saved history first, state second. The state replaces the one before
 system, so what it counts on is there, and rows beyond that belong to nobody and are written again.
 """
 
-import dataclasses
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -82,7 +81,7 @@ class Kept(Forgotten):
             state = filled(blank, arrays)
             self._streamed.resume([(rows, check) for rows, check in header["history"]])
             # Known results are the members themselves.
-            return dataclasses.replace(state, result=MEMBERS[name_of(state.result)]), header["done"]
+            return state._replace(result=MEMBERS[name_of(state.result)]), header["done"]
 
     def border(self, state: State, done: int, last: bool) -> None:
         began = time.monotonic()

@@ -78,7 +78,7 @@ class Continuation(AbstractExactSolver):
     def step(self, problem: PerformativeProblem, state: State, key: Any) -> State:
         own, first = state.own, state.steps == 0
         xp, _ = numerics(problem, state)
-        tolerance = self.accuracy(problem)
+        tolerance = self.accuracy(problem, state.M.dtype)
         eps = xp.finfo(state.M.dtype).eps
         here = xp.append(state.M.reshape(-1), own.level)
         end = xp.eye(here.size, dtype=here.dtype)[-1]
@@ -138,7 +138,7 @@ class Continuation(AbstractExactSolver):
         own = state.own
         residual = residual_of(problem, state.M, state.M)
         unfinished = Result.running if stopped else Result.not_converged
-        arrived = (own.level >= 1) & (residual <= self.accuracy(problem))
+        arrived = (own.level >= 1) & (residual <= self.accuracy(problem, state.M.dtype))
         stats = {"residual": residual, "unique": own.unique, "level": own.level}
         unfinished = choose(state.result == Result.not_differentiable, Result.not_differentiable, unfinished)
         return choose(arrived, Result.success, unfinished), stats

@@ -58,9 +58,9 @@ class AbstractExactSolver(AbstractSolver):
         require_moments(problem)
         check_tolerance(self.tolerance, problem.dtype)
 
-    def accuracy(self, problem: PerformativeProblem) -> float:
+    def accuracy(self, problem: PerformativeProblem, dtype: Any) -> float:
         """The tolerance to which the fixed point is solved for: of a sampled one well below its standard error."""
-        least = check_tolerance(None if isinstance(problem, Sampled) else self.tolerance, problem.dtype)
+        least = check_tolerance(None if isinstance(problem, Sampled) else self.tolerance, dtype)
         if not isinstance(problem, Sampled):
             return least
         return max(SHARE * (TOLERANCE if self.tolerance is None else self.tolerance), 10 * least)

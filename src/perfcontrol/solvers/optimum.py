@@ -102,7 +102,7 @@ class PerformativeOptimum(AbstractExactSolver):
         xp, _ = numerics(problem, state)
         M, value, gradient = own.best, own.value, own.gradient
         finite = xp.isfinite(value)
-        tolerance = self.accuracy(problem)
+        tolerance = self.accuracy(problem, state.M.dtype)
         gap = frobenius(_gap(problem, M, gradient, own.step))
         rounding = COST_NOISE * xp.sqrt(xp.finfo(gap.dtype).eps) * xp.abs(value)
         lengths = xp.asarray([0.25**i for i in range(max(self.starts, LEAST))], M.dtype)
@@ -141,7 +141,7 @@ class PerformativeOptimum(AbstractExactSolver):
         residual = _residual(problem, M, gradient, state.own.step)
         unfinished = Result.running if stopped else Result.not_converged
         failed = choose(state.result == Result.nonfinite, Result.nonfinite, unfinished)
-        result = choose(residual <= self.accuracy(problem), Result.success, failed)
+        result = choose(residual <= self.accuracy(problem, state.M.dtype), Result.success, failed)
         xp, _ = numerics(problem, M)
         unique = xp.asarray(True)
         if M.size <= DENSE_LIMIT:

@@ -1,6 +1,9 @@
 """How a run ended. The text of a member says what to do."""
 
+from typing import Any
+
 import equinox as eqx
+import numpy as np
 
 
 class Result(eqx.Enumeration):
@@ -44,6 +47,11 @@ MEMBERS = {
     name: getattr(Result, name)
     for name in ("success", "running", "diverged", "nonfinite", "undersampled", "not_differentiable", "not_converged")
 }
+
+
+def ended(result: Any, member: Result) -> Any:
+    """`result == member`, which costs nothing where the result is a member itself."""
+    return np.asarray(result is member) if any(result is known for known in MEMBERS.values()) else result == member
 
 
 def name_of(result: Result) -> str:

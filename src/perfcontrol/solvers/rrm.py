@@ -77,7 +77,7 @@ class RRM(AbstractExactSolver):
         return start(M0, _Own(far, zero, xp.asarray(True), 1e8 * (1 + frobenius(M0)), mixing))
 
     def step(self, problem: PerformativeProblem, state: State, key: Any) -> State:
-        own, tolerance = state.own, self.accuracy(problem)
+        own, tolerance = state.own, self.accuracy(problem, state.M.dtype)
         response = respond(problem, state.M, inner_steps=self.inner_steps)
         following, mixing = response.M, own.mixing
         xp, _ = numerics(following)

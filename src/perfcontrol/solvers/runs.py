@@ -136,13 +136,19 @@ def from_host(run: Run, keeping: Forgotten) -> State:
     state, done = keeping.begin(solver.init(problem, on_host(M0)))
     if not history.rows:
         history.add(_recorded(record, M0))
+    opened = solver.opening(problem, state, total) if done == 0 < total else None
     while done < total and state.result is Result.running:  # known results are the members themselves
-        state = solver.step(problem, state, None if key is None else jax.random.fold_in(key, done))
-        done += 1
+        if done == 0 and opened is not None:
+            state, policies = opened
+        else:
+            state = solver.step(problem, state, None if key is None else jax.random.fold_in(key, done))
+            policies = [state.M]
         ended = state.result is not Result.running
-        # What is repeated is where the run ended, be it between two records.
-        if done % every == 0 or (ended and history.rows <= total // every):
-            history.add(_recorded(record, state.M))
+        for M in policies:
+            done += 1
+            # What is repeated is where the run ended, be it between two records.
+            if done % every == 0 or (ended and M is policies[-1] and history.rows <= total // every):
+                history.add(_recorded(record, M))
         keeping.border(state, done, last=done == total or ended)
         if progress is not None:
             progress(done, total)

@@ -3,18 +3,18 @@
 from collections.abc import Callable
 from typing import Any
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from perfcontrol._checks import check_instance, check_integer, check_key, fail, is_concrete
-from perfcontrol._programs import on_host
+from perfcontrol._checks import check_instance, check_integer, check_key, fail
+from perfcontrol._programs import known, on_host, program
 from perfcontrol.problem import PerformativeProblem, check_problem, warn_of_unstable_gain
+from perfcontrol.response.projected import nearest
+from perfcontrol.sets import AbstractSet, Unconstrained
 from perfcontrol.solvers.base import AbstractSolver, Solution, SolveError
 from perfcontrol.solvers.checkpoint import Forgotten, kept
-from perfcontrol.solvers.result import Result
+from perfcontrol.solvers.result import Result, ended
 from perfcontrol.solvers.runs import Record, Run, described, from_host, identity, in_chunks, traced
 
 
@@ -63,13 +63,13 @@ def solve(
         if function is not None and not callable(function):
             raise fail(name, type(function).__name__, "be callable", "Pass a function, or leave it out.")
     total = solver.max_steps if max_steps is None else check_integer("max_steps", max_steps, 0)
-    M0 = problem.initial_policy() if M0 is None else problem.check_policy("M0", M0)
-    leaves = jax.tree.leaves(eqx.filter((problem, solver, M0, key), eqx.is_array))
-    concrete = all(is_concrete(leaf) for leaf in leaves)
+    M0 = _nearest_to_zero(problem) if M0 is None else problem.check_policy("M0", M0)
+    concrete = known(problem, solver, M0, key)
     if concrete:
         check_feasible("M0", problem, M0)
     warn_of_unstable_gain(problem)
-    run = Run(problem, solver, M0, key, total, identity if record is None else record, every, progress)
+    start = M0 if concrete else jnp.asarray(M0)
+    run = Run(problem, solver, start, key, total, identity if record is None else record, every, progress)
     stopped = max_steps is not None and max_steps < solver.max_steps
     if not concrete and checkpoint is not None:
         raise fail("checkpoint", str(checkpoint), "be left out under jit and vmap", "Call pc.solve itself.")
@@ -85,14 +85,14 @@ def solve(
                 solution = keeping.solution()
                 if solution is None:
                     solution = _finished(run, stopped, keeping)
-    if throw and solution.result != Result.success:
+    if throw and not ended(solution.result, Result.success):
         raise SolveError(f"{Result[solution.result]} (step {int(solution.steps)})", solution)
     return solution
 
 
-def check_feasible(name: str, problem: PerformativeProblem, M: Array) -> None:
+def check_feasible(name: str, problem: PerformativeProblem, M: Any) -> None:
     """Raise unless a known policy lies in the feasible set."""
-    if not bool(problem.feasible_set.contains(M, slack(M))):
+    if not isinstance(problem.feasible_set, Unconstrained) and not _contains(problem.feasible_set, M, slack(M)):
         raise fail(
             name,
             f"a policy {float(jnp.linalg.norm(M - problem.feasible_set.project(M))):.3g} away",
@@ -101,10 +101,22 @@ def check_feasible(name: str, problem: PerformativeProblem, M: Array) -> None:
         )
 
 
+def _nearest_to_zero(problem: PerformativeProblem) -> Any:
+    """`problem.initial_policy()`, on the host where the problem is known."""
+    if not known(problem):
+        return problem.initial_policy()
+    return nearest(problem.feasible_set, np.zeros(problem.policy_shape, problem.dtype))
+
+
+@program
+def _contains(feasible_set: AbstractSet, M: Any, tolerance: float) -> Array:
+    return feasible_set.contains(M, tolerance)
+
+
 def _finished(run: Run, stopped: bool, keeping: Forgotten) -> Solution:
     """The solution of a run whose numbers are known, by another method where this one fails and has one."""
     solution = _ended(run, stopped, keeping)
-    rescuer = None if stopped or solution.result == Result.success else run.solver.rescue(run.problem)
+    rescuer = None if stopped or ended(solution.result, Result.success) else run.solver.rescue(run.problem)
     if rescuer is not None:
         other = Run(run.problem, rescuer, run.M0, run.key, rescuer.max_steps)
         solution = _rescued(solution, _ended(other, False, keeping.below("rescue", *described(other))))
@@ -114,10 +126,16 @@ def _finished(run: Run, stopped: bool, keeping: Forgotten) -> Solution:
 
 def _ended(run: Run, stopped: bool, keeping: Forgotten) -> Solution:
     """The solution of one method."""
-    state = on_host((from_host if run.solver.from_host else in_chunks)(run, keeping))
+    state = from_host(run, keeping) if run.solver.from_host else on_host(in_chunks(run, keeping))
     result, stats = run.solver.finish(run.problem, state, stopped)
-    M, result, steps, stats = jax.tree.map(jnp.asarray, (state.M, result, state.steps, stats))
+    M, steps, stats = _as_jax((state.M, state.steps, stats))
     return Solution(M, result, steps, keeping.history.all(), stats)
+
+
+@program(on_device=True)
+def _as_jax(tree: Any) -> Any:
+    """NumPy's arrays as JAX's: one program takes less time than an array at a time."""
+    return tree
 
 
 def _rescued(failed: Solution, rescue: Solution) -> Solution:
@@ -129,6 +147,6 @@ def _rescued(failed: Solution, rescue: Solution) -> Solution:
     return Solution(rescue.M, rescue.result, failed.steps + rescue.steps, failed.history, stats)
 
 
-def slack(M: Array) -> float:
+def slack(M: Any) -> float:
     """How far outside of the set rounding may put a policy."""
     return 1e-8 if M.dtype == jnp.float64 else 1e-4

@@ -16,7 +16,8 @@ import numpy as np
 from perfcontrol._linalg import as_dense
 from perfcontrol._programs import on_host, program
 from perfcontrol.costs import QuadraticCost
-from perfcontrol.evaluate.cost_to_go import CostToGo, cost_to_go, world_of
+from perfcontrol.evaluate.cost_to_go import CostToGo, cost_to_go
+from perfcontrol.evaluate.world import world_of
 from perfcontrol.perturbations import NoPerturbation
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.response import response_hessian
