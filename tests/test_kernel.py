@@ -66,10 +66,25 @@ def spheres_from_rest():
     return plain_problem(perturbation=dense, initial_state=pc.Constant(np.zeros(N)), noise=pc.Rademacher(np.ones(N)))
 
 
+def spheres_through_rest():
+    """A state that comes to rest and goes on: what a matrix makes of it in the pass back has no direction."""
+    policy = np.asarray(0.2 * normal(20, 1, 2, 2))[0]  # that of `policies`
+    noise = np.array([[1.0, 0.0], [0.0, 0.0], [0.3, 0.4], [0.1, -0.2]])
+    noise[1] = -policy[:, 0]  # without rounding
+    return pc.PerformativeProblem(
+        system=pc.LinearSystem(np.zeros((2, 2)), np.eye(2)),
+        horizon=4,
+        noise=pc.Sequence(noise),
+        cost=pc.QuadraticCost(np.eye(2), np.eye(2)),
+        perturbation=pc.DensePerturbation([0.3, 0.0, 0.3, 0.3], law="sphere"),
+    )
+
+
 CASES = {
     **{law: (lambda law=law: plain_problem(law)) for law in LAWS},
     "everything varies": everything_varies,
     "spheres from rest": spheres_from_rest,
+    "spheres through rest": spheres_through_rest,
     "no gain": lambda: plain_problem("gaussian", gain=0),
     "no perturbation": lambda: plain_problem(perturbation=pc.NoPerturbation()),
     "diagonal": lambda: plain_problem(
