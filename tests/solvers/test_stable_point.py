@@ -40,22 +40,25 @@ class TestStablePoint(SolverContract):
 # --- the first steps ----------------------------------------------------------------------------------------------
 
 
-def weakly_reacting(slope: float) -> pc.PerformativeProblem:
-    A, B, directions = 0.4 * normal(1, 3, 3), normal(2, 3, 2), 0.2 * normal(3, 2, 3, 3)
+def weakly_reacting(slope: float, plain: bool = True) -> pc.PerformativeProblem:
+    n = 3 if plain else 4
+    A, B, directions = 0.4 * normal(1, n, n), normal(2, n, 2), 0.2 * normal(3, 2, n, n)
     return pc.PerformativeProblem(
         system=pc.LinearSystem(A, B),
         horizon=12,
         memory=2,
-        noise=pc.Rademacher(np.ones(3)),
-        cost=pc.QuadraticCost(np.eye(3), np.eye(2)),
+        noise=pc.Rademacher(np.ones(n), mean=0 if plain else 0.3 * np.ones(n)),
+        cost=pc.QuadraticCost(np.eye(n), np.eye(2)),
         perturbation=pc.DirectionalPerturbation(directions, lambda M: slope * (1 + jnp.sum(M**2)) * jnp.ones(2)),
+        feasible_set=pc.Unconstrained() if plain else pc.RowSum(0.4),
+        structure=pc.FullStructure() if plain else pc.RepeatedBlock(2),
     )
 
 
-@pytest.mark.parametrize("slope", [0.3, 1.0])
+@pytest.mark.parametrize(("slope", "plain"), [(0.3, True), (1.0, True), (0.3, False)])
 @pytest.mark.parametrize("max_steps", [None, 3])
-def test_first_steps_in_one_program_are_those_that_follow_one_another(slope, max_steps, monkeypatch):
-    problem = weakly_reacting(slope)
+def test_first_steps_in_one_program_are_those_that_follow_one_another(slope, plain, max_steps, monkeypatch):
+    problem = weakly_reacting(slope, plain)
 
     def run():
         return pc.solve(problem, SOLVER, max_steps=max_steps, record=jnp.sum, every=2, throw=False)

@@ -96,8 +96,8 @@ def quadratic(problem: PerformativeProblem, world: World) -> Quadratic:
     """The quadratic of a given world, its Hessian as a matrix."""
     zero = jnp.zeros(problem.policy_shape, world.Lambda.dtype)
     linear = weigh(problem, world, zero)[1]
-    matrix = _hessian_matrix(problem, world, linear)
-    return Quadratic(linear, 1 / _largest_eigenvalue(matrix), matrix)
+    matrix = hessian_matrix(problem, world, linear)
+    return Quadratic(linear, 1 / largest_eigenvalue(matrix), matrix)
 
 
 def quadratic_by_passes(problem: PerformativeProblem, world: World) -> Quadratic:
@@ -113,7 +113,7 @@ def quadratic_by_passes(problem: PerformativeProblem, world: World) -> Quadratic
     return Quadratic(linear, 1 / _power_iteration(gradient, linear), None, gradient)
 
 
-def _hessian_matrix(problem: PerformativeProblem, world: World, linear: Array) -> Array:
+def hessian_matrix(problem: PerformativeProblem, world: World, linear: Array) -> Array:
     """The Hessian in the free parameters (p, p)."""
     size = linear.size
     if stationary(world):
@@ -136,7 +136,7 @@ def _hessian_matrix(problem: PerformativeProblem, world: World, linear: Array) -
     return symmetrise(jax.lax.map(column, jnp.eye(size, dtype=linear.dtype), batch_size=min(64, size)))
 
 
-def _largest_eigenvalue(matrix: Array) -> Array:
+def largest_eigenvalue(matrix: Array) -> Array:
     """An upper bound within rounding of ‖matrix‖ for a PSD matrix by power iteration on it, never zero."""
     tiny = jnp.finfo(matrix.dtype).tiny
     unit = jnp.maximum(jnp.max(jnp.abs(matrix)), tiny)  # squares would overflow

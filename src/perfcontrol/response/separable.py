@@ -20,7 +20,8 @@ class Separable:
     """
 
     def __init__(self, factors: Factors, dense: Callable[[], Any]):
-        self.factors, self.dense = factors, dense
+        self.factors = self.form = factors
+        self.dense = dense
         xp, self.linalg = numerics(factors)
         linear, G, G_mean, Sigma, w = factors
         self.shape = linear.shape
