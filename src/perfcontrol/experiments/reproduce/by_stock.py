@@ -84,8 +84,9 @@ def _form(market: Any, total: Any, square: Any) -> Any:
 
 def costs(problem: PerformativeProblem, policies: np.ndarray) -> np.ndarray:
     """Exact C_T(M; M) of policies (..., 1, L, L); `CEILING` where it is larger or overflows."""
-    own = np.diagonal(policies, axis1=-2, axis2=-1)[..., 0, :].astype(float)
-    total, square = (np.sum(part, axis=-1, dtype=float)[..., 0, :] for part in (policies, policies**2))
+    rows = policies[..., 0, :, :].astype(float)
+    total, square = rows @ np.ones(rows.shape[-1]), np.einsum("...ij,...ij->...i", rows, rows)
+    own = np.diagonal(rows, axis1=-2, axis2=-1)
     constant, by_own, by_square = row_form(problem, total, square)
     with np.errstate(invalid="ignore", over="ignore"):
         cost = np.sum(constant + by_own * own + by_square * square, axis=-1)

@@ -1,6 +1,7 @@
 """The paper's runs: what all stages with runs share, and RSGD in every case."""
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax
@@ -59,7 +60,8 @@ class Laboratory(NamedTuple):
         """‖M_n - M^PS‖²_F, with the axes of the runs and one of steps."""
         policies = np.asarray(solution.history)[..., 0, :, :]
         stable = self.exact()["M"].values.reshape(-1, 1, 1, *policies.shape[-2:])[cases]
-        return np.sum((policies - stable) ** 2, axis=(-2, -1))
+        away = policies - stable
+        return np.einsum("...ij,...ij->...", away, away)
 
 
 def laboratory(
@@ -111,7 +113,8 @@ def run_stage(
     solution = lab.run(cases, 2, stream, rule, settings.steps, lambda share: progress("RSGD runs", share))
     taken = np.asarray(solution.steps)
     error, history = lab.errors(cases, solution), np.asarray(solution.history)
-    cost = np.stack([costs(problem, policies) for problem, policies in zip(problems, history, strict=True)])
+    with ThreadPoolExecutor() as pool:
+        cost = np.stack(list(pool.map(costs, problems, history)))
     dims = ("regime", "order", "seed")
     per_step = ((*dims, "step"), (*shape, length))
     data = {

@@ -74,11 +74,14 @@ def reproduce(out: Path, settings: ReproduceSettings, progress: Progress | None 
         cure = stages.run("cure", lambda: cure_stage(lab, bounded_labs, settings, progress))
         sweep = stages.run("sweep", lambda: sweep_stage(lab, settings, progress))
         cure, files = cure.merge(floors.result()), figures.result()
-    exact_bounded = bounded[0].result() if bounded else None
-    claims = stages.timed("claims", lambda: judge(exact.result(), exact_bounded, optimum, runs, cure, sweep, settings))
-    results.save_json([claim.as_dict() for claim in claims], out / "claims.json")
-    results.save_text(as_markdown(claims, settings.model_dump()), out / "claims.md")
-    files += stages.timed("figures", lambda: _figures().draw_cure(out, cure, sweep, settings))
+        cured = pool.submit(stages.timed, "figures", lambda: _figures().draw_cure(out, cure, sweep, settings))
+        exact_bounded = bounded[0].result() if bounded else None
+        claims = stages.timed(
+            "claims", lambda: judge(exact.result(), exact_bounded, optimum, runs, cure, sweep, settings)
+        )
+        results.save_json([claim.as_dict() for claim in claims], out / "claims.json")
+        results.save_text(as_markdown(claims, settings.model_dump()), out / "claims.md")
+        files += cured.result()
     data = [out / f"{stage}.nc" for stage in STAGES if stage in stages.seconds]
     return Outcome([*data, out / "claims.json", out / "claims.md", *files], claims, stages.seconds)
 
