@@ -116,13 +116,9 @@ def _gradient(market: Market, M: Array, deployed: Array, keys: Key[Array, " runs
     end = second[..., None] * (2 * last[0])
     adjoints, _ = _pairs(phi[1:], nu[1:], met, lambda pair: second * (2 * pair[0]), end, reverse=True)
 
-    def of_row(row: tuple[Array, Array]) -> Array:
-        answer, s = row
-        weights = [2 * answer[t] + s[t] for t in range(T - 1)] + [2 * answer[T - 1]]
-        return sum(weight * risk[t] for t, weight in enumerate(weights))  # type: ignore[return-value]
-
-    by_row = jax.lax.map(of_row, (jnp.moveaxis(answer, 1, 0), jnp.moveaxis(adjoints[:, 1], 1, 0)))
-    return by_row + jnp.sum(adjoints[:, 0], axis=0)[:, None] * more
+    weights = 2 * answer + jnp.concatenate([adjoints[:, 1], jnp.zeros_like(answer[:1])])
+    by_risk = jnp.einsum("tlz,tkz->lkz", weights, risk, precision="highest")
+    return by_risk + jnp.sum(adjoints[:, 0], axis=0)[:, None] * more
 
 
 def _written(runs: int, tree: Any) -> Any:
