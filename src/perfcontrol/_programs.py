@@ -26,6 +26,8 @@ else:
 # XLA's newer emitters for the CPU take twice as long to compile these programs and run them no faster, save where many
 # numbers lie side by side.
 QUICK = {"xla_cpu_use_fusion_emitters": False}
+# What LLVM does above its second level takes a tenth to two thirds of the time to compile, and serves loops that draw.
+LESS = {"xla_backend_optimization_level": 2}
 
 
 def known(*trees: Any) -> bool:
@@ -34,13 +36,14 @@ def known(*trees: Any) -> bool:
 
 
 @functools.cache
-def compiler_options() -> dict[str, Any]:
-    """`QUICK` where this version of XLA knows it."""
+def compiler_options(quick: bool = True, whole: bool = True) -> dict[str, Any]:
+    """`QUICK`, and `LESS` without the `whole` effort, where this version of XLA knows them."""
+    wanted = (QUICK if quick else {}) | ({} if whole else LESS)
     try:
-        jax.jit(lambda: 0, compiler_options=QUICK).lower().compile()
-    except Exception:  # whatever it says, the option is not essential
+        jax.jit(lambda: 0, compiler_options=wanted).lower().compile()
+    except Exception:  # whatever it says, the options are not essential
         return {}
-    return QUICK
+    return wanted
 
 
 def _is_array(leaf: Any) -> bool:
@@ -51,12 +54,12 @@ class Program:
     """A pure function, compiled on first use for each kind of arguments; arrays are inputs, all else is fixed.
 
     Known arguments give NumPy arrays (JAX arrays with `on_device=True`); traced ones are worked on in place. `quick`
-    is about the time to compile.
+    and `whole` are those of `compiler_options`.
     """
 
-    def __init__(self, function: Callable, on_device: bool, quick: bool):
+    def __init__(self, function: Callable, on_device: bool, quick: bool, whole: bool):
         functools.update_wrapper(self, function)
-        self.function, self.on_device, self.quick = function, on_device, quick
+        self.function, self.on_device, self.quick, self.whole = function, on_device, quick, whole
 
     def _jit(self, **options: Any) -> Callable:
         def run(fixed: tuple[Any, tuple], inputs: list) -> Any:
@@ -70,7 +73,7 @@ class Program:
 
     @functools.cached_property
     def _standing(self) -> Callable:
-        return self._jit(compiler_options=compiler_options() if self.quick else None)
+        return self._jit(compiler_options=compiler_options(self.quick, self.whole))
 
     @functools.cached_property
     def _inlined(self) -> Callable:
@@ -96,11 +99,14 @@ class Program:
             return self._standing(fixed, inputs)
 
 
-def program(function: Callable | None = None, *, on_device: bool = False, quick: bool = True) -> Any:
-    """Make `function` a `Program`; with `on_device=True` its answers stay JAX arrays."""
+def program(
+    function: Callable | None = None, *, on_device: bool = False, quick: bool = True, whole: bool | None = None
+) -> Any:
+    """Make `function` a `Program`; with `on_device=True` its answers stay JAX arrays, and it is taken for long work,
+    which is worth the `whole` effort of the compiler unless told otherwise."""
     if function is None:
-        return functools.partial(program, on_device=on_device, quick=quick)
-    return Program(function, on_device, quick)
+        return functools.partial(program, on_device=on_device, quick=quick, whole=whole)
+    return Program(function, on_device, quick, on_device if whole is None else whole)
 
 
 def numerics(*trees: Any) -> tuple[ModuleType, ModuleType]:

@@ -55,7 +55,7 @@ def _weighed_cost(world: Foreseen, M: Array, key: Array) -> tuple[Array, Array]:
     return weight * jnp.sum(world.cost.path_cost(path.x, path.u)), weight
 
 
-@program
+@program(whole=True)
 def values_and_gradients(world: Foreseen, policies: Any) -> tuple[Array, Array]:
     """C_N and its total derivative at policies stacked along the first axis."""
 
@@ -81,7 +81,7 @@ def value_and_gradient(world: Foreseen, M: Any) -> tuple[Any, Any]:
     return values[0], gradients[0]
 
 
-@program
+@program(whole=True)
 def curvature(world: Foreseen, M: Any) -> tuple[Array, Array]:
     """The total Hessian of C_N (p, p), and the covariance (p, p) of what single paths add to its gradient."""
     value, slope_there = value_and_gradient(world, M)

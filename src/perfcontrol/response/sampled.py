@@ -71,7 +71,7 @@ def average(world: Sampled, one: Any, like: Any) -> Any:
     return jax.tree.map(lambda leaf: leaf / jnp.asarray(world.samples, leaf.dtype), total)
 
 
-@program
+@program(whole=True)
 def averages(world: Sampled, M: Any, deployed: Any) -> Averages:
     """What Newton's method and the standard error need to know at M while the world reacts to `deployed`."""
     reacting = world.structure.lift(deployed)
@@ -92,7 +92,7 @@ def averages(world: Sampled, M: Any, deployed: Any) -> Averages:
     return Averages(cost, slope.reshape(M.shape), (hessian + hessian.T) / 2, second - jnp.outer(slope, slope))
 
 
-@program
+@program(whole=True)
 def reaction(world: Sampled, M: Any, deployed: Any) -> Array:
     """∂_2 of the mean gradient at M, (p, p): how the paths, and with them the gradient, move with `deployed`."""
     policy = world.structure.lift(M)

@@ -119,7 +119,7 @@ def _advance(
 
 
 advance = program(_advance, on_device=True)
-advance_wide = program(_advance, on_device=True, quick=False)
+advance_wide = program(_advance, on_device=True, quick=False, whole=False)
 
 
 @program(on_device=True)
