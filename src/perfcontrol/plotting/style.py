@@ -99,15 +99,16 @@ def looks(names: Iterable[str]) -> dict[str, Look]:
 
 def save_figure(figure: Figure, path: Path) -> list[Path]:
     """Write PNG and SVG beside each other; `path` has no suffix."""
-    engine = figure.get_layout_engine()
-    if engine is not None:  # once for both files: the layout takes longer than the drawing
+    engine, files = figure.get_layout_engine(), []
+    if engine is not None:  # once for both files, and as the first of them is drawn, whose text need not be set again
+        if plt.rcParams["savefig.dpi"] != "figure":
+            figure.set_dpi(plt.rcParams["savefig.dpi"])
         engine.execute(figure)
         figure.set_layout_engine("none")
-    around, files = figure.get_tightbbox().padded(0.1), []  # inches; likewise
     for suffix in (".png", ".svg"):
         target = path.with_name(path.name + suffix)
         with written_whole(target) as temporary:
-            figure.savefig(temporary, bbox_inches=around, metadata={"Date": None} if suffix == ".svg" else None)
+            figure.savefig(temporary, metadata={"Date": None} if suffix == ".svg" else None)
         files.append(target)
     plt.close(figure)
     return files

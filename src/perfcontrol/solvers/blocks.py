@@ -36,19 +36,21 @@ class Work(NamedTuple):
     def run(self, rows: Rows, show: Callable[[int], None]) -> dict[str, Any]:
         """What every row has ended with, on the host; `show` is called with the iterations done."""
         state, kept = begin(self.lanes, self.record, self.shared, rows)
-        history = [_on_host(kept)]
+        history: list[Any] = []
         chunk, done = max(self.every, CHUNK - CHUNK % self.every), 0
         while done < self.total and bool(jnp.any(state.result == Result.running)):
             count = min(chunk, self.total - done)
             rest = count % self.every
             if count > rest:
-                state, kept = self._advanced(rows, state, done, count - rest, self.record, self.every)
-                history.append(_on_host(kept))
+                state, following = self._advanced(rows, state, done, count - rest, self.record, self.every)
+                history.append(_on_host(kept))  # while the devices go on
+                kept = following
             if rest:
                 state, _ = self._advanced(rows, state, done + count - rest, rest, None, 1)
             done += count
             if done < self.total:
                 show(done)
+        history.append(_on_host(kept))
         ended = finish(self.lanes, self.stopped, self.shared, rows, state)
         length = self.total // self.every + 1
         return _on_host(ended) | {"history": jax.tree.map(lambda *parts: _whole(parts, length), *history)}
@@ -109,7 +111,7 @@ def run_blocks(
                 folder.write(name, answer)
         show(work.total)
         ended.append(answer)
-    return jax.tree.map(lambda *parts: np.concatenate(parts), *ended)
+    return ended[0] if len(ended) == 1 else jax.tree.map(lambda *parts: np.concatenate(parts), *ended)
 
 
 def _read(folder: RunFolder, name: str, blank: Callable[[], Any], size: int) -> Any:
