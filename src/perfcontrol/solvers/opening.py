@@ -22,7 +22,6 @@ from perfcontrol.evaluate.world import world_of
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.response import Response
 from perfcontrol.response.affine import tangent_space
-from perfcontrol.response.definite import Definite
 from perfcontrol.response.methods import is_free, is_held
 from perfcontrol.response.quadratic import Factors, Quadratic, factors, hessian_matrix, largest_eigenvalue
 from perfcontrol.response.respond import moved_by
@@ -86,7 +85,9 @@ class _Tangent:
     """Of the last step on an affine set: the quadratic, and whether A is regular."""
 
     def __init__(self, form: Quadratic, A: Any):
-        self.form, self.step, self.regular = form, form.step, Definite(A).regular
+        self.form, self.step = form, form.step
+        values = np.linalg.eigvalsh(A)
+        self.regular = values[0] > len(A) * np.finfo(A.dtype).eps * values[-1]
 
 
 Respond = Callable[[Array], tuple[Array, Any]]

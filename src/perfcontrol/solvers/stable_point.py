@@ -30,6 +30,7 @@ from perfcontrol.solvers.result import Result, ended
 
 CONTRACTING = 0.1  # repeated minimisation goes on while each step shrinks the gap at least tenfold
 HALVINGS = 6
+ROUNDINGS = 20
 KRYLOV = 30
 DENSE = 64  # free parameters up to which Φ' is a matrix, not products
 CONTINUED = 256  # free parameters up to which a stable policy is also looked for by continuation
@@ -93,8 +94,11 @@ class StablePoint(AbstractExactSolver):
         if found is None:
             return None
         policies, images, gaps, response = found
-        for M, image, gap in zip(policies, images, gaps, strict=True):  # of all responses but the last only M counts
-            state = self._judged(problem, state, M, response._replace(M=image), gap)
+        if len(policies) > 1:  # all steps but the last have gone well: there is nothing to judge
+            before = response._replace(M=images[-2])  # of which only M counts
+            own = state.own._replace(response=before, gap=gaps[-2], limit=_limit(policies[0], images[0]))
+            state = State(policies[-2], state.steps + len(policies) - 1, state.result, own)
+        state = self._judged(problem, state, policies[-1], response, gaps[-1])
         taken = np.array_equal(state.M, policies[-1])  # a step taken back falls to the method at large
         return (state, list(policies)) if taken else None
 
@@ -134,7 +138,7 @@ class StablePoint(AbstractExactSolver):
         finite = xp.isfinite(gap) & xp.all(xp.isfinite(following))
         ratio = gap / xp.where(own.gap > 0, own.gap, 1)  # zero at the first step: a step of minimisation follows
         scale = frobenius(following)
-        limit = xp.where(state.steps == 0, FAR * (1 + scale + frobenius(response.M)), own.limit)
+        limit = xp.where(state.steps == 0, _limit(following, response.M), own.limit)
         done = gap <= self._enough(problem, M.dtype) * xp.where(scale > 0, scale, 1)
         # A Newton step that no longer helps has reached rounding, or is stuck: `finish` tells which by the residual.
         stalled = ~contracting & ~_helps(own, following, gap)
@@ -164,8 +168,8 @@ class StablePoint(AbstractExactSolver):
         }
 
     def _enough(self, problem: PerformativeProblem, dtype: Any) -> float:
-        """The gap, relative to ‖M‖, at which a policy is taken for stable."""
-        return 0.1 * self.accuracy(problem, dtype)
+        """The gap, relative to ‖M‖, at which a policy is taken for stable: not one that is rounding."""
+        return max(0.1 * self.accuracy(problem, dtype), ROUNDINGS * float(np.finfo(dtype).eps))
 
     def _residual(self, problem: PerformativeProblem, state: State) -> Any:
         """Of the last policy: a by-product of its response, where there is one."""
@@ -173,6 +177,11 @@ class StablePoint(AbstractExactSolver):
         if known is None:
             return residual_of(problem, M, M)
         return cond(state.steps > 0, lambda: known, lambda: residual_of(problem, M, M))
+
+
+def _limit(M: Any, response: Any) -> Any:
+    """Of ‖M‖ for Newton's steps, by what the first step met."""
+    return FAR * (1 + frobenius(M) + frobenius(response))
 
 
 def _helps(own: _Own, M: Any, gap: Any) -> Any:
