@@ -230,6 +230,15 @@ def test_region_of_batch_means_uses_the_quantile_of_hotelling_and_student():
     assert_close(region.upper.ravel() - region.centre.ravel(), [student], 1e-9)
 
 
+def test_steps_that_a_set_leaves_as_they_are_do_not_count_as_cut_short():
+    wide = performative_prediction(0.5, feasible_set=pc.Box(-1000.0, 1000.0))
+    run = pc.solve(wide, pc.RSGD(30, 0.1, average=True), key=KEY)
+    assert int(run.stats["clipped"]) == 0 < float(jnp.sum(jnp.abs(run.M)))
+    narrow = performative_prediction(0.5, feasible_set=pc.Box(-1.0, 1.0))
+    cut = pc.solve(narrow, pc.RSGD(30, 0.1, average=True), key=KEY)
+    assert int(cut.stats["clipped"]) == int(cut.stats["averaged"])
+
+
 def test_region_is_refused_where_it_would_mislead():
     run = pc.solve(performative_prediction(0.5), pc.RSGD(30, 0.1, average=True), key=KEY)
     for level in (0.0, 1.0, "high"):
