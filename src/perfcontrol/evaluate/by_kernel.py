@@ -18,6 +18,7 @@ from perfcontrol.perturbations.counted import Counted
 from perfcontrol.perturbations.white_draws import WhiteDraws
 from perfcontrol.problem import PerformativeProblem
 
+REGISTER = 64  # bytes of one number of all paths that the kernel works on together, `Lanes` in numbers.h
 NONE, MATRICES, SIGNS, UNIFORM, PRODUCTS = range(5)  # `Reaction` in arguments.h
 Plain = Callable[[PerformativeProblem, Array, Array, Key[Array, ""]], Array]
 

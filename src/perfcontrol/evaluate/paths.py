@@ -17,7 +17,7 @@ from perfcontrol.problem import PerformativeProblem
 
 LANES = 8  # paths that a device should have at least
 REGISTER = 32  # bytes of one number of all paths worked on together: with more the compiler leaves vectors alone
-REGISTERS = 8  # of paths for one call of the kernel
+REGISTERS = 4  # of paths for one call of the kernel
 TOGETHER = 2**27  # bytes of paths that the kernel is still better given together, in one register
 CACHE = 2**24  # bytes of paths beyond which working on more of them together slows them down
 
@@ -48,14 +48,14 @@ def lanes(problem: PerformativeProblem, along: bool = False) -> int:
     Paths that have large matrices of their own are better worked on one by one; the kernel is given several registers
     of them at once.
     """
-    register = REGISTER // problem.dtype.itemsize
     fitting = CACHE // bytes_held(problem, along)
     if by_kernel.serves(problem):
+        register = by_kernel.REGISTER // problem.dtype.itemsize
         least = register if register * bytes_held(problem, along) <= TOGETHER else 1
         return max(least, min(REGISTERS * register, fitting))
     if any(leaf.ndim == 3 and max(leaf.shape[1:]) > FUSED for leaf in _drawn(problem, along)):
         return 1
-    return max(1, min(register, fitting))
+    return max(1, min(REGISTER // problem.dtype.itemsize, fitting))
 
 
 def devices_for(samples: int, *given: Any) -> int:

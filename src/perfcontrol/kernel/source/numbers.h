@@ -10,16 +10,19 @@
 namespace perfcontrol {
 
 template <typename T>
-constexpr size_t kWidth = 32 / sizeof(T);
-
-template <typename T>
-struct Together {
+struct Vectors {
   using Register __attribute__((vector_size(32))) = T;
-  Register lanes;
+  using Lanes __attribute__((vector_size(64))) = T;  // one register or two: each entry of a matrix serves twice as many
 };
 
 template <typename T>
-using Register = typename Together<T>::Register;
+using Register = typename Vectors<T>::Register;
+
+template <typename T>
+using Lanes = typename Vectors<T>::Lanes;
+
+template <typename T>
+constexpr size_t kWidth = sizeof(Register<T>) / sizeof(T);
 
 // A number of `kLanes` paths.
 template <typename T, bool kTogether>
@@ -32,8 +35,8 @@ struct Kind {
 
 template <typename T>
 struct Kind<T, true> {
-  using Number = Register<T>;
-  static constexpr size_t kLanes = kWidth<T>;
+  using Number = Lanes<T>;
+  static constexpr size_t kLanes = sizeof(Lanes<T>) / sizeof(T);
   static size_t Padded(size_t size) { return size; }
 };
 

@@ -12,7 +12,7 @@
 
 namespace perfcontrol {
 
-constexpr size_t kHeld = size_t{1} << 20;  // bytes of drawn matrices kept for the way back; beyond, drawn again
+constexpr size_t kHeld = size_t{1} << 21;  // bytes of drawn matrices kept for the way back; beyond, drawn again
 
 template <typename T, bool kTogether>
 class Path {

@@ -59,7 +59,9 @@ void Run(const Work& work, size_t first, size_t last, T* costs, T* gradients) {
 template <typename T>
 void RunAll(const Work& work, Answer cost, Answer gradients) {
   T *costs = static_cast<T*>(cost->untyped_data()), *out = static_cast<T*>(gradients->untyped_data());
-  const size_t count = cost->element_count(), alone = count % kWidth<T> == 1 ? 1 : 0;
+  constexpr size_t kLanes = Kind<T, true>::kLanes;
+  const size_t count = cost->element_count(), left = count % kLanes;
+  const size_t alone = left <= kLanes / 4 ? left : 0;  // so few are faster one by one
   Run<T, true>(work, 0, count - alone, costs, out);
   Run<T, false>(work, count - alone, count, costs, out);
 }

@@ -37,11 +37,12 @@ inline T Sum(Register<T> value) {
 // a · b, of padded vectors.
 template <typename T, bool kTogether, typename Number = typename Kind<T, kTogether>::Number>
 inline Number Dot(const Number* a, const Number* b, size_t size) {
-  Register<T> sum{};
   if constexpr (kTogether) {
+    Number sum{};
     for (size_t i = 0; i < size; ++i) sum += a[i] * b[i];
     return sum;
   } else {
+    Register<T> sum{};
     for (size_t i = 0; i < size; i += kWidth<T>) sum += Load(a + i) * Load(b + i);
     return Sum<T>(sum);
   }
@@ -97,18 +98,18 @@ inline void AddByRows(const T* packed, const T* x, size_t padded, T* y, size_t o
 
 // y_i += factor · Σ_j A_ij x_j with A_ij at i `row` + j `column`, the same for all paths or of each its own.
 template <typename T, typename Entry>
-inline void AddTogether(const Entry* A, size_t row, size_t column, const Register<T>* x, size_t inputs, Register<T>* y,
-                        size_t outputs, Register<T> factor) {
+inline void AddTogether(const Entry* A, size_t row, size_t column, const Lanes<T>* x, size_t inputs, Lanes<T>* y,
+                        size_t outputs, Lanes<T> factor) {
   size_t i = 0;
   for (; i + 3 < outputs; i += 4) {
-    Register<T> sums[4]{};
+    Lanes<T> sums[4]{};
     for (size_t j = 0; j < inputs; ++j) {
       for (size_t k = 0; k < 4; ++k) sums[k] += A[(i + k) * row + j * column] * x[j];
     }
     for (size_t k = 0; k < 4; ++k) y[i + k] += factor * sums[k];
   }
   for (; i < outputs; ++i) {
-    Register<T> sum{};
+    Lanes<T> sum{};
     for (size_t j = 0; j < inputs; ++j) sum += A[i * row + j * column] * x[j];
     y[i] += factor * sum;
   }
@@ -116,7 +117,7 @@ inline void AddTogether(const Entry* A, size_t row, size_t column, const Registe
 
 // --- matrices of the problem -----------------------------------------------------------------------------------------
 
-// A, or Aᵀ, packed anew only where it is another one.
+// A, or Aᵀ, looked at and packed anew only where it is another one. A diagonal costs as many products as it has entries.
 template <typename T, bool kTogether>
 class Matrix {
  public:
@@ -130,21 +131,28 @@ class Matrix {
   void AddTo(const Series<T, kTogether>& A, size_t t, const Number* x, Number* y, T factor = 1, size_t offset = 0) {
     const size_t inputs = transposed_ ? rows_ : columns_, outputs = transposed_ ? columns_ : rows_;
     const size_t row = transposed_ ? 1 : columns_, column = transposed_ ? columns_ : 1;
-    if constexpr (!kTogether) {
-      Pack(A, t, offset);
+    const T* shared = A.data[0] + t * A.step + offset;
+    Meet(A, t, offset, shared);
+    if (diagonal_) {
+      for (size_t i = 0; i < rows_; ++i) y[i] += factor * shared[i * (columns_ + 1)] * x[i];
+    } else if constexpr (!kTogether) {
       AddRows(packed_.data(), x, inputs, y, padded_, factor);
     } else if (A.shared) {
-      AddTogether<T>(A.data[0] + t * A.step + offset, row, column, x, inputs, y, outputs, Number{} + factor);
+      AddTogether<T>(shared, row, column, x, inputs, y, outputs, Number{} + factor);
     } else {
-      Pack(A, t, offset);
       AddTogether<T>(packed_.data(), row, column, x, inputs, y, outputs, Number{} + factor);
     }
   }
 
  private:
-  void Pack(const Series<T, kTogether>& A, size_t t, size_t offset) {
-    if (A.data == packed_from_ && t * A.step + offset == packed_at_) return;
-    packed_from_ = A.data, packed_at_ = t * A.step + offset;
+  void Meet(const Series<T, kTogether>& A, size_t t, size_t offset, const T* shared) {
+    if (A.data == met_ && t * A.step + offset == met_at_) return;
+    met_ = A.data, met_at_ = t * A.step + offset;
+    diagonal_ = A.shared && rows_ == columns_;
+    for (size_t i = 0; i < rows_ && diagonal_; ++i) {
+      for (size_t j = 0; j < columns_; ++j) diagonal_ &= i == j || shared[i * columns_ + j] == 0;
+    }
+    if (diagonal_ || (kTogether && A.shared)) return;
     packed_.assign(kTogether ? rows_ * columns_ : (transposed_ ? rows_ : columns_) * padded_, Number{});
     for (size_t i = 0; i < rows_; ++i) {
       for (size_t j = 0; j < columns_; ++j) {
@@ -155,9 +163,9 @@ class Matrix {
   }
 
   size_t rows_, columns_, padded_;
-  bool transposed_;
-  std::array<const T*, Kind<T, kTogether>::kLanes> packed_from_{};
-  size_t packed_at_ = 0;
+  bool transposed_, diagonal_ = false;
+  std::array<const T*, Kind<T, kTogether>::kLanes> met_{};
+  size_t met_at_ = 0;
   std::vector<Number> packed_;
 };
 
