@@ -7,6 +7,7 @@ import pytest
 import scipy.stats
 
 import perfcontrol as pc
+from perfcontrol.random_keys import ENABLE_X64
 from tests.tools import assert_mean_is, assert_refused
 
 WORD = 2**64
@@ -40,7 +41,7 @@ def _squares(key: jax.Array, count: int, width: int) -> list[int]:
 
 def _bits(key: jax.Array, count: int, width: int = 32) -> np.ndarray:
     """Raw numbers, read as pairs where 64-bit integers are switched off."""
-    with jax.enable_x64(True):
+    with ENABLE_X64(True):
         return np.asarray(jax.random.bits(key, (count,), f"uint{width}"))
 
 

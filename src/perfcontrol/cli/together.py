@@ -21,7 +21,7 @@ class Block(NamedTuple):
     """Places in the grid, what is solved there, and to how many points the block is filled up."""
 
     places: list[int]
-    plans: list["Plan"]
+    plans: "list[Plan]"
     size: int
 
     def solved(self) -> list["Run"]:
@@ -29,7 +29,7 @@ class Block(NamedTuple):
         return [solved(self.plans[0], lambda *_: None)] if self.size == 1 else _solved_together(self.plans, self.size)
 
 
-def blocks(plans: Iterable["Plan"], count: int) -> Iterator[Block]:
+def blocks(plans: "Iterable[Plan]", count: int) -> Iterator[Block]:
     """All plans in blocks; one by one where they differ in more than numbers or where compiling would take longer."""
     open_blocks: list[tuple[Any, Block]] = []  # few kinds: compared one by one, since not all of them can be hashed
     for place, plan in enumerate(plans):
@@ -65,7 +65,7 @@ def _kind(plan: "Plan", count: int) -> Any:
     return structure, alike, fingerprint(solver), plan.seed
 
 
-def _solved_together(plans: list["Plan"], size: int) -> list["Run"]:
+def _solved_together(plans: "list[Plan]", size: int) -> "list[Run]":
     import jax
     import jax.numpy as jnp
     import numpy as np
