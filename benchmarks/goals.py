@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 
+from benchmarks.at_once import AT_ONCE
 from benchmarks.gradients import BY_KERNEL
 from benchmarks.measure import Row
 
@@ -33,6 +34,11 @@ def goals_table(rows: list[Row], small: str, large: str) -> str:
         "one path, uniform entries, float64, of (a)",
         250,
         both(lambda by: printed[small] / took[uniform, DRAWN + by]),
+    )
+    add(
+        "the same, called at once",
+        250,
+        both(lambda by: printed[small] / took[uniform, DRAWN + by + AT_ONCE]),
     )
     for law, least in (
         ("uniform entries", 850),

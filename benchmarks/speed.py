@@ -8,6 +8,7 @@ give what the machine can do, and how much of it is used.
 import jax
 
 import perfcontrol as pc
+from benchmarks import at_once
 from benchmarks.evaluation import exact_rows, stable_rows, sweep_rows
 from benchmarks.goals import goals_table
 from benchmarks.gradients import gradient_rows, kernel_rows, lane_rows, sampled_rows, seed_rows
@@ -44,6 +45,7 @@ def table(quick: bool) -> str:
             for law, kind in LAWS.items():
                 rows += kernel_rows(f"dense, {kind} {name}", problem_of(*shape, law=law), printed[name])
     pc.use_kernel(False)
+    rows += at_once.rows(f"dense, uniform entries {SMALL}")
     directional, stock = problem_of(20, 1, 60, "directional"), pc.experiments.stock_market("random")
     families = {"dense": problem_of(20, 1, 60), "directional": directional, "stock": stock}
     for kind in ("directional", "stock"):

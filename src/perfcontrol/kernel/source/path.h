@@ -14,6 +14,13 @@ namespace perfcontrol {
 
 constexpr size_t kHeld = size_t{1} << 21;  // bytes of drawn matrices kept for the way back; beyond, drawn again
 
+// Room for drawn matrices, kept from call to call: new memory costs more than what is written into it.
+template <typename Number>
+std::vector<Number>& Room() {
+  static thread_local std::vector<Number> room;
+  return room;
+}
+
 template <typename T, bool kTogether>
 class Path {
  public:
@@ -32,7 +39,8 @@ class Path {
     const bool drawn = reaction == kSigns || reaction == kUniform;
     held_ = drawn && gradient && horizon_ * n_ * pn_ * sizeof(Number) <= kHeld;
     if (drawn) flat_.resize(n_ * n_);
-    if (drawn || reaction == kMatrices) Z_.resize((held_ ? horizon_ : 1) * n_ * pn_);
+    const size_t room = drawn || reaction == kMatrices ? (held_ ? horizon_ : 1) * n_ * pn_ : 0;
+    if (Z_.size() < room) Z_.resize(room);
   }
 
   // x_{t+1} = A_t x_t + B_t u_t + w_t + Δ_t x_t,  u_t = Σ_i M[i-1] w_{t-i} - K_t x_t.
@@ -102,7 +110,7 @@ class Path {
     if (held_ && again) return Z;
     if (reaction_ == kMatrices) {
       for (size_t i = 0; i < n_; ++i) {
-        for (size_t j = 0; j < n_; ++j) Z[i * pn_ + j] = g.matrices.At(t, i * n_ + j);
+        for (size_t j = 0; j < pn_; ++j) Z[i * pn_ + j] = j < n_ ? g.matrices.At(t, i * n_ + j) : Number{};
       }
       return Z;
     }
@@ -113,7 +121,10 @@ class Path {
     T* flat = kTogether ? reinterpret_cast<T*>(Z) : flat_.data();
     Fill<T, kLanes>(reaction_ == kSigns, streams, redrawn_ ? 0 : t * n_ * n_, n_ * n_, flat);
     if constexpr (!kTogether) {
-      for (size_t i = 0; i < n_; ++i) std::copy_n(flat_.data() + i * n_, n_, Z + i * pn_);
+      for (size_t i = 0; i < n_; ++i) {
+        std::copy_n(flat_.data() + i * n_, n_, Z + i * pn_);
+        std::fill_n(Z + i * pn_ + n_, pn_ - n_, T{0});
+      }
     }
     return Z;
   }
@@ -174,7 +185,8 @@ class Path {
   std::vector<Matrix<T, kTogether>> M_;
   std::vector<Number> x_, by_x_, w_, by_u_;
   size_t kept_;  // 1 where the gradients of all stages are, for the way back; else 0
-  std::vector<Number> u_, du_, dx_, y_, now_, unit_, to_policy_, Z_;
+  std::vector<Number> u_, du_, dx_, y_, now_, unit_, to_policy_;
+  std::vector<Number>& Z_ = Room<Number>();
   std::vector<T> flat_;
 };
 
