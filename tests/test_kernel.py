@@ -1,5 +1,6 @@
 """The kernel in C++ against the package's own loops on the same keys, and what is said where there is no compiler."""
 
+import ctypes
 import os
 import shutil
 import subprocess
@@ -10,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.special
 
 import perfcontrol as pc
 from perfcontrol.evaluate.adjoint import mean_path_gradient
@@ -310,6 +312,29 @@ def test_run_begun_without_the_kernel_does_not_go_on_with_it(kernel, tmp_path):
         begin(stop)
     kernel(True)
     assert_refused(begin, "checkpoint", "kernel in use")
+
+
+def test_every_normal_number_is_that_of_jax_to_rounding(tmp_path):
+    """All 2²³ of them, in single precision."""
+    source, probe = tmp_path / "probe.cc", tmp_path / "probe.so"
+    source.write_text("""
+#include "random.h"
+extern "C" void all(float* out) {
+  for (uint32_t digits = 0; digits < (1u << 23); ++digits) out[digits] = perfcontrol::NormalOf(digits << 9);
+}
+""")
+    compiler = next(filter(shutil.which, library.COMPILERS))
+    flags = ["-std=c++17", "-O2", "-shared", "-fPIC", f"-I{library.SOURCES}"]
+    subprocess.run([compiler, *flags, str(source), "-o", str(probe)], check=True)
+    ours = np.empty(2**23, np.float32)
+    ctypes.CDLL(str(probe)).all(ours.ctypes.data_as(ctypes.c_void_p))
+    digits = np.arange(2**23, dtype=np.float32) * np.float32(2.0**-23)
+    lowest = np.nextafter(np.float32(-1), np.float32(0))
+    number = np.maximum(lowest, digits * np.float32(2) + lowest)
+    theirs = np.sqrt(np.float32(2)) * np.asarray(jax.scipy.special.erfinv(number))
+    assert np.max(np.abs(ours - theirs)) < 3e-5  # of which JAX's own error is the larger part
+    exact = np.sqrt(2) * scipy.special.erfinv(number.astype(float))
+    assert np.max(np.abs(ours - exact)) < 2e-6
 
 
 # --- the compiler ----------------------------------------------------------------------------------------------------

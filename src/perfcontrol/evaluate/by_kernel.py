@@ -19,7 +19,7 @@ from perfcontrol.perturbations.white_draws import WhiteDraws
 from perfcontrol.problem import PerformativeProblem
 
 REGISTER = 64  # bytes of one number of all paths that the kernel works on together, `Lanes` in numbers.h
-NONE, MATRICES, SIGNS, UNIFORM, PRODUCTS = range(5)  # `Reaction` in arguments.h
+NONE, MATRICES, SIGNS, UNIFORM, PRODUCTS, NORMAL = range(6)  # `Reaction` in arguments.h
 Plain = Callable[[PerformativeProblem, Array, Array, Key[Array, ""]], Array]
 
 
@@ -33,7 +33,7 @@ class _Reaction(NamedTuple):
     matrices: Array | None = None  # (T, n, n)
     ahead: Array | None = None  # (T, n), as in `WhiteDraws`
     back: Array | None = None  # (T, n)
-    rest: Array | None = None  # (T, 2)
+    rest: Array | None = None  # (T, 2), there or, of normal numbers, `Counted.chi`
     each: bool = False
 
 
@@ -111,8 +111,9 @@ def _reaction(problem: PerformativeProblem, deployed: Array, key: Key[Array, ""]
         return _Reaction(NONE, nothing)
     drawn = _drawn(problem, deployed, key)
     if isinstance(drawn, Counted):
-        kind = SIGNS if drawn.signs else UNIFORM
-        return _Reaction(kind, jax.random.key_data(drawn.key), drawn.scale, drawn.location, each=drawn.each)
+        kind = {"rademacher": SIGNS, "uniform": UNIFORM, "normal": NORMAL}[drawn.law]
+        words = jax.random.key_data(drawn.key)
+        return _Reaction(kind, words, drawn.scale, drawn.location, rest=drawn.chi, each=drawn.each)
     if isinstance(drawn, WhiteDraws):
         products = {"ahead": drawn.ahead, "back": drawn.back, "rest": drawn.rest}
         return _Reaction(PRODUCTS, nothing, drawn.scale, drawn.location, **products)

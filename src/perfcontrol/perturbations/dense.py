@@ -23,7 +23,7 @@ from perfcontrol.perturbations.base import (
 from perfcontrol.perturbations.counted import Counted
 from perfcontrol.perturbations.dependence import as_scale, check_values
 from perfcontrol.perturbations.scalar_laws import SCALAR_LAWS
-from perfcontrol.perturbations.white_draws import normal_draws, sphere_draws
+from perfcontrol.perturbations.white_draws import normal_draws, sphere_draws, sphere_numbers
 from perfcontrol.policy_maps import AbstractPolicyMap, as_policy_map, evaluate_map
 from perfcontrol.random_keys import is_fast
 from perfcontrol.random_vectors import AbstractRandomVector
@@ -195,13 +195,20 @@ class DensePerturbation(AbstractPerturbation):
         return BY_PRODUCTS[self.kind](key, location, jnp.broadcast_to(values, (horizon,)), *self._shape(M))
 
     def counted(self, key: Key[Array, ""], M: Array, horizon: int) -> Counted | None:
-        """What `sample` would draw, before it is drawn: signs or uniform entries of a common scale from a fast key."""
+        """What `sample_along` would draw, before it is drawn: entries of a common scale from a fast key.
+
+        Signs and uniform entries; in single precision normal ones and the sphere, too.
+        """
         values = as_array("scale", evaluate_map(self.scale, M, "scale"))
-        if self.kind not in ("rademacher", "uniform") or values.ndim > 1 or not is_fast(key):
+        by_products = self.kind in BY_PRODUCTS and values.dtype == jnp.float32
+        if not (by_products or self.kind in ("rademacher", "uniform")) or values.ndim > 1 or not is_fast(key):
             return None
         location = None if self.mean_map is None else evaluate_map(self.mean_map, M, "mean")
         scale = jnp.broadcast_to(values, (horizon,))
-        return Counted(key, scale, location, self.kind == "rademacher", self._is_redrawn(M, values, horizon))
+        if not by_products:
+            return Counted(key, scale, location, self.kind, each=self._is_redrawn(M, values, horizon))
+        key, chi = sphere_numbers(key, scale, *self._shape(M)) if self.kind == "sphere" else (key, None)
+        return Counted(key, scale, location, "normal", chi)
 
     def _is_redrawn(self, M: Array, values: Array, horizon: int) -> bool:
         """Whether matrices, alike at all times, are too many to be held."""

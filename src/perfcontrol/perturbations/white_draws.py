@@ -74,12 +74,18 @@ def normal_draws(key: Key[Array, ""], location: Array | None, scale: Float[Array
 
 def sphere_draws(key: Key[Array, ""], location: Array | None, scale: Float[Array, " T"], n: int, p: int) -> WhiteDraws:
     """Uniform on Frobenius spheres of radius s_t √(n p) about Θ_t."""
-    normal_key, chi_key = jax.random.split(key)
+    normal_key, chi = sphere_numbers(key, scale, n, p)
     normal = normal_draws(normal_key, location, scale, n, p)
-    squared, rest = chi_squares(chi_key, (n * (p - 1), (n - 1) * (p - 1)), scale)
+    squared, rest = chi[:, 0], chi[:, 1]
     factor = jnp.sqrt(n * p / (jnp.sum(normal.ahead**2, axis=1) + squared))
     rest = jnp.stack([jnp.sqrt(squared) * factor, rest], axis=1)
     return WhiteDraws(location, scale, normal.ahead * factor[:, None], normal.back, rest)
+
+
+def sphere_numbers(key: Key[Array, ""], scale: Float[Array, " T"], n: int, p: int) -> tuple[Array, Array]:
+    """The key of the normal numbers of a sphere; ρ² before it is scaled, and χ², (T, 2)."""
+    normal_key, chi_key = jax.random.split(key)
+    return normal_key, jnp.stack(chi_squares(chi_key, (n * (p - 1), (n - 1) * (p - 1)), scale), axis=1)
 
 
 def chi_squares(key: Key[Array, ""], degrees: tuple[int, ...], like: Float[Array, " T"]) -> list[Float[Array, " T"]]:

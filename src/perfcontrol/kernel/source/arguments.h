@@ -14,7 +14,7 @@
 
 namespace perfcontrol {
 
-enum Reaction : int64_t { kNone = 0, kMatrices = 1, kSigns = 2, kUniform = 3, kProducts = 4 };
+enum Reaction : int64_t { kNone = 0, kMatrices = 1, kSigns = 2, kUniform = 3, kProducts = 4, kNormal = 5 };
 
 struct Sizes {
   size_t n, m, memory, horizon;

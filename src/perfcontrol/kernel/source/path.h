@@ -35,11 +35,12 @@ class Path {
         location_(n_, n_, false), locationT_(n_, n_, true), M_(memory_, Matrix<T, kTogether>(m_, n_, false)),
         x_((horizon_ + 1) * pn_), by_x_((gradient ? horizon_ + 1 : 1) * pn_), w_(x_.size()),
         by_u_((gradient ? horizon_ + 1 : 1) * pm_), kept_(gradient), u_(pm_), du_(pm_),
-        dx_(pn_), y_(pn_), now_(pn_), unit_(pn_), to_policy_(memory_ * m_ * pn_) {
-    const bool drawn = reaction == kSigns || reaction == kUniform;
-    held_ = drawn && gradient && horizon_ * n_ * pn_ * sizeof(Number) <= kHeld;
+        dx_(pn_), y_(pn_), now_(pn_), unit_(pn_), ahead_(pn_), to_policy_(memory_ * m_ * pn_) {
+    const bool drawn = reaction == kSigns || reaction == kUniform || reaction == kNormal;
+    entries_ = reaction == kNormal ? 2 * n_ : n_ * pn_;
+    held_ = drawn && gradient && horizon_ * entries_ * sizeof(Number) <= kHeld;
     if (drawn) flat_.resize(n_ * n_);
-    const size_t room = drawn || reaction == kMatrices ? (held_ ? horizon_ : 1) * n_ * pn_ : 0;
+    const size_t room = drawn || reaction == kMatrices ? (held_ ? horizon_ : 1) * entries_ : 0;
     if (Z_.size() < room) Z_.resize(room);
   }
 
@@ -104,9 +105,9 @@ class Path {
   }
 
  private:
-  // Z_t, by rows.
+  // Z_t, by rows; of normal entries the numbers that its two products are made of.
   const Number* Drawn(const Given<T, kTogether>& g, size_t t, bool again) {
-    Number* Z = Z_.data() + (held_ ? t * n_ * pn_ : 0);
+    Number* Z = Z_.data() + (held_ ? t * entries_ : 0);
     if (held_ && again) return Z;
     if (reaction_ == kMatrices) {
       for (size_t i = 0; i < n_; ++i) {
@@ -118,10 +119,13 @@ class Path {
     if (redrawn_) {
       for (Stream& stream : streams) stream = stream.FoldIn(t);
     }
-    T* flat = kTogether ? reinterpret_cast<T*>(Z) : flat_.data();
-    Fill<T, kLanes>(reaction_ == kSigns, streams, redrawn_ ? 0 : t * n_ * n_, n_ * n_, flat);
+    const bool whole = kTogether || reaction_ == kNormal;  // as they come, or row by row with zeros behind
+    const Law law = reaction_ == kSigns ? Law::kSigns : reaction_ == kUniform ? Law::kUniform : Law::kNormal;
+    const size_t count = reaction_ == kNormal ? 2 * n_ : n_ * n_;
+    T* to = whole ? reinterpret_cast<T*>(Z) : flat_.data();
+    Fill<T, kLanes>(law, streams, redrawn_ ? 0 : t * count, count, to);
     if constexpr (!kTogether) {
-      for (size_t i = 0; i < n_; ++i) {
+      for (size_t i = 0; i < n_ && !whole; ++i) {
         std::copy_n(flat_.data() + i * n_, n_, Z + i * pn_);
         std::fill_n(Z + i * pn_ + n_, pn_ - n_, T{0});
       }
@@ -139,11 +143,32 @@ class Path {
     }
   }
 
+  bool ByProducts() const { return reaction_ == kProducts || reaction_ == kNormal; }
+
+  // Leaves in ahead_ what `WhiteDraws` calls so, and returns its ρ, with normal entries brought to the sphere here.
+  Number MakeAhead(const Given<T, kTogether>& g, size_t t, bool again) {
+    Number factor = Number{} + 1, squared{};
+    if (reaction_ == kProducts) {
+      for (size_t i = 0; i < n_; ++i) ahead_[i] = g.ahead.At(t, i);
+      return g.rest.present ? g.rest.At(t, 0) : factor;
+    }
+    const Number* normal = Drawn(g, t, again);
+    if (!g.rest.present) {
+      std::copy_n(normal, n_, ahead_.begin());
+      return factor;
+    }
+    for (size_t i = 0; i < n_; ++i) squared += normal[i] * normal[i];
+    factor = Root(static_cast<T>(n_ * n_) * Inverse(squared + g.rest.At(t, 0)));
+    for (size_t i = 0; i < n_; ++i) ahead_[i] = factor * normal[i];
+    return factor * Root(g.rest.At(t, 0));
+  }
+
   // to += Δ_t x.
   void React(const Given<T, kTogether>& g, size_t t, const Number* x, Number* to) {
-    if (reaction_ == kProducts) {
+    if (ByProducts()) {
+      MakeAhead(g, t, false);
       const Number size = g.scale.At(t, 0) * Root(Dot<T, kTogether>(x, x, pn_));
-      for (size_t i = 0; i < n_; ++i) to[i] += size * g.ahead.At(t, i);
+      for (size_t i = 0; i < n_; ++i) to[i] += size * ahead_[i];
     } else if (reaction_ != kNone) {
       AddDrawn(Drawn(g, t, false), false, x, to, g.scale.At(t, 0));
     }
@@ -152,7 +177,7 @@ class Path {
 
   // to += Δ_tᵀ y, after Δ_t was applied to x.
   void ReactBack(const Given<T, kTogether>& g, size_t t, const Number* x, const Number* y, Number* to) {
-    if (reaction_ == kProducts) {
+    if (ByProducts()) {
       ProductsBack(g, t, x, y, to);
     } else if (reaction_ != kNone) {
       AddDrawn(Drawn(g, t, true), true, y, to, g.scale.At(t, 0));
@@ -163,29 +188,31 @@ class Path {
   // As `WhiteDraws` has it: the part along x is known from the way ahead, the part across is free.
   void ProductsBack(const Given<T, kTogether>& g, size_t t, const Number* x, const Number* y, Number* to) {
     const Number size = Root(Dot<T, kTogether>(x, x, pn_)), inverse = Inverse(size);
+    const Number radius = MakeAhead(g, t, true);
     Number* back = dx_.data();
+    const Number* normal = Z_.data() + (held_ ? t * entries_ : 0);  // drawn by MakeAhead
+    for (size_t i = 0; i < n_; ++i) back[i] = reaction_ == kProducts ? g.back.At(t, i) : normal[n_ + i];
     for (size_t i = 0; i < n_; ++i) unit_[i] = inverse * x[i];
     unit_[0] += 1 - IsPositive(size);  // any direction will do where x vanishes
-    for (size_t i = 0; i < n_; ++i) back[i] = g.back.At(t, i);
     const Number along = Dot<T, kTogether>(unit_.data(), back, pn_);
     for (size_t i = 0; i < n_; ++i) back[i] -= along * unit_[i];
     Number across = g.scale.At(t, 0) * Root(Dot<T, kTogether>(y, y, pn_)), reached{};
     if (g.rest.present) {
-      across *= g.rest.At(t, 0) * Inverse(Root(Dot<T, kTogether>(back, back, pn_) + g.rest.At(t, 1)));
+      across *= radius * Inverse(Root(Dot<T, kTogether>(back, back, pn_) + g.rest.At(t, 1)));
     }
-    for (size_t i = 0; i < n_; ++i) reached += g.ahead.At(t, i) * y[i];
+    for (size_t i = 0; i < n_; ++i) reached += ahead_[i] * y[i];
     reached *= g.scale.At(t, 0);
     for (size_t i = 0; i < n_; ++i) to[i] += reached * unit_[i] + across * back[i];
   }
 
-  size_t n_, m_, pn_, pm_, memory_, horizon_;
+  size_t n_, m_, pn_, pm_, memory_, horizon_, entries_ = 0;
   Reaction reaction_;
   bool redrawn_, held_ = false;
   Matrix<T, kTogether> A_, B_, K_, Q_, R_, N_, AT_, BT_, KT_, NT_, location_, locationT_;
   std::vector<Matrix<T, kTogether>> M_;
   std::vector<Number> x_, by_x_, w_, by_u_;
   size_t kept_;  // 1 where the gradients of all stages are, for the way back; else 0
-  std::vector<Number> u_, du_, dx_, y_, now_, unit_, to_policy_;
+  std::vector<Number> u_, du_, dx_, y_, now_, unit_, ahead_, to_policy_;
   std::vector<Number>& Z_ = Room<Number>();
   std::vector<T> flat_;
 };

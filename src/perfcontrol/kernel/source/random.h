@@ -5,6 +5,7 @@
 
 #include <algorithm>
 #include <array>
+#include <cmath>
 #include <cstddef>
 #include <cstdint>
 
@@ -61,9 +62,50 @@ inline double Uniform(double, uint64_t counter, uint64_t k) {
   return digits * (2 * kRoot3) - kRoot3;
 }
 
-// Numbers `first`, `first` + 1, ... of each stream, side by side.
-template <typename T, size_t kLanes>
-void FillUniform(const std::array<Stream, kLanes>& streams, uint64_t first, size_t count, T* out) {
+// log y for 0 < y <= 1, to a rounding or two: exponent, and a polynomial on [√½, √2] (S. Moshier's Cephes).
+inline float Logarithm(float y) {
+  const uint32_t bits = __builtin_bit_cast(uint32_t, y);
+  const float mantissa = __builtin_bit_cast(float, (bits & 0x7FFFFFu) | 0x3F800000u);
+  const bool high = mantissa > 1.41421356f;
+  const float exponent = static_cast<float>(static_cast<int32_t>(bits >> 23) - (high ? 126 : 127));
+  const float t = (high ? 0.5f * mantissa : mantissa) - 1, z = t * t;
+  float p = 7.0376836292e-2f;
+  p = p * t - 1.1514610310e-1f;
+  p = p * t + 1.1676998740e-1f;
+  p = p * t - 1.2420140846e-1f;
+  p = p * t + 1.4249322787e-1f;
+  p = p * t - 1.6668057665e-1f;
+  p = p * t + 2.0000714765e-1f;
+  p = p * t - 2.4999993993e-1f;
+  p = p * t + 3.3333331174e-1f;
+  return exponent * 0.693359375f + (t + (t * z * p - 0.5f * z - 2.12194440e-4f * exponent));
+}
+
+// Standard normal, as `jax.random.normal` makes it of a uniform number on (-1, 1): by the inverse of the error function
+// (M. Giles, "Approximating the erfinv function", 2010).
+inline float NormalOf(uint32_t word) {
+  const float digits = static_cast<float>(static_cast<int32_t>(word >> 9)) * 0x1p-23f;
+  const float lowest = -0x1.fffffep-1f, x = digits > 0 ? digits * 2 + lowest : lowest;
+  const float w = -Logarithm((1 - x) * (1 + x)), a = w - 2.5f, b = std::sqrt(w) - 3;
+  float p = 2.81022636e-08f, q = -0.000200214257f;
+  p = p * a + 3.43273939e-07f, q = q * b + 0.000100950558f;
+  p = p * a - 3.5233877e-06f, q = q * b + 0.00134934322f;
+  p = p * a - 4.39150654e-06f, q = q * b - 0.00367342844f;
+  p = p * a + 0.00021858087f, q = q * b + 0.00573950773f;
+  p = p * a - 0.00125372503f, q = q * b - 0.0076224613f;
+  p = p * a - 0.00417768164f, q = q * b + 0.00943887047f;
+  p = p * a + 0.246640727f, q = q * b + 1.00167406f;
+  p = p * a + 1.50140941f, q = q * b + 2.83297682f;
+  return 1.41421356f * (x * (w < 5 ? p : q));
+}
+
+inline float Normal(float, uint64_t counter, uint64_t k) { return NormalOf(Word32(counter, k)); }
+
+inline double Normal(double, uint64_t, uint64_t) { return 0; }  // drawn by JAX
+
+// What `Draw` makes of numbers `first`, `first` + 1, ... of each stream, side by side.
+template <typename T, size_t kLanes, T (*Draw)(T, uint64_t, uint64_t)>
+void FillEach(const std::array<Stream, kLanes>& streams, uint64_t first, size_t count, T* out) {
   uint64_t k[kLanes], start[kLanes];
   for (size_t lane = 0; lane < kLanes; ++lane) {
     k[lane] = streams[lane].Multiplier();
@@ -71,11 +113,11 @@ void FillUniform(const std::array<Stream, kLanes>& streams, uint64_t first, size
   }
   if constexpr (kLanes == 1) {
 #pragma omp simd
-    for (size_t i = 0; i < count; ++i) out[i] = Uniform(T{}, start[0] + i, k[0]);
+    for (size_t i = 0; i < count; ++i) out[i] = Draw(T{}, start[0] + i, k[0]);
   } else {
     for (size_t i = 0; i < count; ++i) {
 #pragma omp simd
-      for (size_t lane = 0; lane < kLanes; ++lane) out[i * kLanes + lane] = Uniform(T{}, start[lane] + i, k[lane]);
+      for (size_t lane = 0; lane < kLanes; ++lane) out[i * kLanes + lane] = Draw(T{}, start[lane] + i, k[lane]);
     }
   }
 }
@@ -101,12 +143,16 @@ void FillSigns(const std::array<Stream, kLanes>& streams, uint64_t first, size_t
   }
 }
 
+enum class Law { kSigns, kUniform, kNormal };
+
 template <typename T, size_t kLanes>
-void Fill(bool signs, const std::array<Stream, kLanes>& streams, uint64_t first, size_t count, T* out) {
-  if (signs) {
+void Fill(Law law, const std::array<Stream, kLanes>& streams, uint64_t first, size_t count, T* out) {
+  if (law == Law::kSigns) {
     FillSigns<T, kLanes>(streams, first, count, out);
+  } else if (law == Law::kUniform) {
+    FillEach<T, kLanes, Uniform>(streams, first, count, out);
   } else {
-    FillUniform<T, kLanes>(streams, first, count, out);
+    FillEach<T, kLanes, Normal>(streams, first, count, out);
   }
 }
 
