@@ -19,7 +19,7 @@ from perfcontrol._files import cache_folder, written_whole
 SOURCES = Path(__file__).parent / "source"
 COMPILERS = ("c++", "g++", "clang++")
 # Sums may be taken in any order where a loop says so, and nowhere else: what is not finite stays so.
-FLAGS = ("-std=c++17", "-O3", "-fPIC", "-shared", "-fopenmp-simd", "-w")
+FLAGS = ("-std=c++17", "-O3", "-fPIC", "-shared", "-fopenmp-simd", "-fno-math-errno", "-fno-trapping-math", "-w")
 FOR_THIS_PROCESSOR = "-march=native"  # not every compiler knows it
 TARGET = "perfcontrol_paths"
 WAIT = 300  # seconds that a compiler may take
