@@ -24,6 +24,8 @@ SLOW = (
     "test_intersection.py::test_best_response_on_an_intersection_equals_that_on_the_same_set_written_as_one",
     "test_intersection.py::test_intersection_without_newton_steps_still_converges",
     "test_intersection.py::test_intersection_projection_differentiates_in_the_parameters_of_its_sets",
+    "test_bound.py::test_stocks_are_bounded_row_by_row[rows-True]",
+    "test_market.py::test_allocations_are_feasible_and_are_what_they_are_called[rows]",
     "test_properties.py::test_single_precision_answers_like_double_precision",
     "test_stock.py::test_stable_policy_is_where_repeated_minimisation_goes_in_all_nine_cases[simplex]",
 )
