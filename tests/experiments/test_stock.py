@@ -141,7 +141,8 @@ def test_stable_policy_is_stationary_for_the_dense_moment_oracle(nine):
 
 def _oracle_cost(M: np.ndarray, deployed: np.ndarray, order: str, growth: float) -> float:
     """Appendix A in the oracle's terms: Δ_t = [[E V - I, V - E V], [0, V - I]], V = diag(portfolio e_t)."""
-    first, second = growth_moments(np.log(stock_sensitivities(order)), 0.05, "lognormal")
+    first, variance = growth_moments(np.log(stock_sensitivities(order)), 0.05, "lognormal")
+    second = variance + first**2
     portfolio = deployed / EXPOSURE
     gram = portfolio @ portfolio.T
     eye, zero = np.eye(10), np.zeros((10, 10))

@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Key
-from scipy import special
 
 from perfcontrol._checks import as_array, check_integer, check_shape, fail, is_concrete
 from perfcontrol.random_vectors.base import AbstractRandomVector
@@ -39,25 +38,26 @@ def price_ratios(unit: Array, log_sensitivity: Array, rate: Any, horizon: int, k
 
 
 def growth_moments(log_sensitivity: np.ndarray, rate: float, kind: str) -> tuple[np.ndarray, np.ndarray]:
-    """E e and E e² for each time, by Gauss-Legendre quadrature between the kinks of the clip."""
+    """E e and Var e for each time, by Gauss-Legendre quadrature between the kinks of the clip.
+
+    About the growth at the centre, so that little cancels; what lies beyond nine standard deviations is put there.
+    """
     horizon = len(log_sensitivity)
     nodes, weights = np.polynomial.legendre.leggauss(80)
-    first, second = np.zeros(horizon), np.zeros(horizon)
+    first, variance = np.zeros(horizon), np.zeros(horizon)
     for t, centre in enumerate(log_sensitivity):
         ends = (-np.inf, math.log(LIMIT)) if kind == "lognormal" else (-LIMIT, LIMIT)
         kinks = [float(np.clip((end - centre) / SPREAD, -9.0, 9.0)) for end in ends]
         edges = np.unique([-9.0, *kinks, 9.0])
+        centre_growth = _growth(_volatility(0.0, centre, kind, np), rate, horizon, np)
+        mean, square = 0.0, 0.0
         for low, high in itertools.pairwise(edges):
             normal = (low + high) / 2 + (high - low) / 2 * nodes
             density = np.exp(-(normal**2) / 2) / math.sqrt(2 * math.pi) * weights * (high - low) / 2
-            growth = _growth(_volatility(normal, centre, kind, np), rate, horizon, np)
-            first[t] += density @ growth
-            second[t] += density @ growth**2
-        tails = 2 * special.ndtr(-9.0)  # what lies beyond nine standard deviations, put at the centre
-        centre_growth = _growth(_volatility(0.0, centre, kind, np), rate, horizon, np)
-        first[t] += tails * centre_growth
-        second[t] += tails * centre_growth**2
-    return first, second
+            growth = _growth(_volatility(normal, centre, kind, np), rate, horizon, np) - centre_growth
+            mean, square = mean + density @ growth, square + density @ growth**2
+        first[t], variance[t] = centre_growth + mean, square - mean**2
+    return first, variance
 
 
 class StochasticVolatility(AbstractRandomVector):
@@ -93,9 +93,9 @@ class StochasticVolatility(AbstractRandomVector):
         self.log_sensitivity = jnp.log(sensitivities)
         self.volatility = volatility
         self.alike = None if stocks is None else jnp.ones(check_integer("stocks", stocks, 1), sensitivities.dtype)
-        first, second = growth_moments(np.log(np.asarray(sensitivities, dtype=float)), float(self.rate), volatility)
+        first, variance = growth_moments(np.log(np.asarray(sensitivities, dtype=float)), float(self.rate), volatility)
         self.first_moment = jnp.asarray(first, sensitivities.dtype)
-        self.variance = jnp.asarray(second - first**2, sensitivities.dtype)
+        self.variance = jnp.asarray(variance, sensitivities.dtype)
 
     def resize(self, size: int) -> "StochasticVolatility":
         if self.alike is not None:
