@@ -383,6 +383,11 @@ def test_library_that_others_could_have_written_is_not_loaded(fresh, monkeypatch
     assert (fresh / "calls").read_text().count("called") == 2
 
 
+def test_folder_that_cannot_be_written_is_told(fresh, monkeypatch):
+    (fresh / "cache").write_text("a file")
+    assert_refused(pc.use_kernel, "PERFCONTROL_CACHE", "can be written to")
+
+
 def test_library_is_compiled_once_and_again_for_another_source(fresh, monkeypatch):
     last = 'for last; do :; done; echo called >> "$(dirname "$0")/calls"; echo library > "$last"'
     monkeypatch.setenv("CXX", script(fresh, last))

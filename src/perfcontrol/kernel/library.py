@@ -116,12 +116,20 @@ def compiled() -> Path:
         digest.update(source.read_bytes())
     library = cache_folder() / "kernel" / f"{digest.hexdigest()[:32]}.so"
     if not _is_own(library):
-        with written_whole(library) as made:
-            said = _errors(compiler, [FOR_THIS_PROCESSOR], made) and _errors(compiler, [], made)
-            if said:
-                remedy = "Name another compiler: CXX=g++. Without the kernel everything works as well, only slower."
-                raise fail("CXX", f"{' '.join(compiler)}, which said: {said}", "compile the kernel (C++17)", remedy)
+        try:
+            _compile(compiler, library)
+        except OSError as error:
+            got = f"{library.parent} ({error.strerror or type(error).__name__})"
+            raise fail("PERFCONTROL_CACHE", got, "be a folder that can be written to", "Name another one.") from error
     return library
+
+
+def _compile(compiler: list[str], library: Path) -> None:
+    with written_whole(library) as made:
+        said = _errors(compiler, [FOR_THIS_PROCESSOR], made) and _errors(compiler, [], made)
+        if said:
+            remedy = "Name another compiler: CXX=g++. Without the kernel everything works as well, only slower."
+            raise fail("CXX", f"{' '.join(compiler)}, which said: {said}", "compile the kernel (C++17)", remedy)
 
 
 def _errors(compiler: list[str], extra: list[str], library: Path) -> str:
