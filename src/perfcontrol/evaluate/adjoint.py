@@ -12,16 +12,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
-from perfcontrol._checks import as_array, check_integer, check_key, check_shape, fail
+from perfcontrol._checks import as_array, check_shape, fail
 from perfcontrol._linalg import times, times_transposed, transpose
 from perfcontrol._programs import program
 from perfcontrol.evaluate.by_kernel import by_kernel
-from perfcontrol.evaluate.paths import devices_for, over_paths
+from perfcontrol.evaluate.paths import over_paths
 from perfcontrol.evaluate.rollout import (
     Path,
     Trajectories,
-    check_pair,
-    cut_off,
+    check_paths,
     input_adjoint,
     input_term,
     sample_along,
@@ -168,8 +167,5 @@ def sample_gradient(
     Raises:
         InputError: wrong shapes, a missing key, samples < 1, an infinite horizon without truncation.
     """
-    M, reacting = check_pair(problem, M, deployed)
-    finite, weight = cut_off(problem, truncation)
-    key, samples = check_key(key), check_integer("samples", samples, 1)
-    devices = devices_for(samples, finite, M, reacting, key)
-    return weight * _compiled_mean_path_gradient(finite, M, reacting, key, samples, devices)
+    asked = check_paths(problem, M, deployed, key, samples, truncation)
+    return asked.weight * _compiled_mean_path_gradient(*asked.arguments)

@@ -6,11 +6,10 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
-from perfcontrol._checks import check_integer, check_key
 from perfcontrol._programs import program
 from perfcontrol.evaluate.by_kernel import by_kernel
-from perfcontrol.evaluate.paths import devices_for, over_paths
-from perfcontrol.evaluate.rollout import check_pair, cut_off, sample_along
+from perfcontrol.evaluate.paths import over_paths
+from perfcontrol.evaluate.rollout import check_paths, sample_along
 from perfcontrol.problem import PerformativeProblem
 
 
@@ -68,8 +67,6 @@ def estimate_cost(
     Raises:
         InputError: as `simulate`; at least two samples are needed for a standard error.
     """
-    M, reacting = check_pair(problem, M, deployed)
-    finite, weight = cut_off(problem, truncation)
-    key, samples = check_key(key), check_integer("samples", samples, 2)
-    costs = weight * _path_costs(finite, M, reacting, key, samples, devices_for(samples, finite, M, reacting, key))
-    return Estimate(jnp.mean(costs), jnp.std(costs, ddof=1) / jnp.sqrt(samples))
+    asked = check_paths(problem, M, deployed, key, samples, truncation, least=2)
+    costs = asked.weight * _path_costs(*asked.arguments)
+    return Estimate(jnp.mean(costs), jnp.std(costs, ddof=1) / jnp.sqrt(asked.samples))

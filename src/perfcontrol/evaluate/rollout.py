@@ -4,7 +4,7 @@ The time loop holds one matrix-vector product, one perturbation product and an a
 depend on the state is computed in bulk around it. Under vmap it takes a step of all paths at once (`time_loop`).
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -151,6 +151,32 @@ def cut_off(problem: PerformativeProblem, truncation: Any) -> tuple[Performative
     return problem.truncated(truncation), 1 / (truncation + 1)
 
 
+class Asked(NamedTuple):
+    """What is asked of simulated paths, checked: arguments of a program, and the weight of its answer."""
+
+    problem: PerformativeProblem
+    M: Array
+    deployed: Array
+    key: Key[Array, ""]
+    samples: int
+    weight: float
+
+    @property
+    def arguments(self) -> tuple[Any, ...]:
+        """All but the weight, and the number of devices to work on."""
+        given = self.problem, self.M, self.deployed, self.key
+        return *given, self.samples, devices_for(self.samples, *given)
+
+
+def check_paths(
+    problem: PerformativeProblem, M: Any, deployed: Any, key: Any, samples: Any, truncation: Any, least: int = 1
+) -> Asked:
+    """The arguments that `simulate`, `pc.estimate_cost` and `pc.sample_gradient` have in common."""
+    M, reacting = check_pair(problem, M, deployed)
+    finite, weight = cut_off(problem, truncation)
+    return Asked(finite, M, reacting, check_key(key), check_integer("samples", samples, least), weight)
+
+
 def simulate(
     problem: PerformativeProblem,
     M: Any,
@@ -176,12 +202,10 @@ def simulate(
         InputError: wrong shapes, a missing key, samples < 1, an infinite horizon without truncation, paths that do
             not fit into the memory.
     """
-    M, reacting = check_pair(problem, M, deployed)
-    finite, weight = cut_off(problem, truncation)
-    key, samples = check_key(key), check_integer("samples", samples, 1)
-    _check_fits(finite, samples)
-    devices = devices_for(samples, finite, M, reacting, key)
-    paths = _simulate(finite, M, reacting, key, samples, devices)
+    asked = check_paths(problem, M, deployed, key, samples, truncation)
+    _check_fits(asked.problem, asked.samples)
+    *arguments, devices = asked.arguments
+    paths = _simulate(*arguments, devices)
     if devices > 1:  # what is done with paths next is no affair of all devices
         paths = jax.device_put(paths, jax.local_devices()[0])
-    return eqx.tree_at(lambda p: p.cost, paths, weight * paths.cost)
+    return eqx.tree_at(lambda p: p.cost, paths, asked.weight * paths.cost)

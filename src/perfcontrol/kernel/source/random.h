@@ -29,24 +29,20 @@ struct Stream {
 
 inline uint64_t Swapped(uint64_t x) { return (x >> 32) | (x << 32); }
 
-inline uint32_t Word32(uint64_t counter, uint64_t k) {
-  uint64_t x = counter * k;
-  const uint64_t y = x, z = y + k;
-  x = Swapped(x * x + y);
+// The fourth round of squaring, `first` being counter times k.
+inline uint64_t Fourth(uint64_t first, uint64_t k) {
+  const uint64_t z = first + k;
+  uint64_t x = Swapped(first * first + first);
   x = Swapped(x * x + z);
-  x = Swapped(x * x + y);
-  return static_cast<uint32_t>((x * x + z) >> 32);
+  x = Swapped(x * x + first);
+  return x * x + z;
 }
 
+inline uint32_t Word32(uint64_t counter, uint64_t k) { return static_cast<uint32_t>(Fourth(counter * k, k) >> 32); }
+
 inline uint64_t Word64(uint64_t counter, uint64_t k) {
-  uint64_t x = counter * k;
-  const uint64_t y = x, z = y + k;
-  x = Swapped(x * x + y);
-  x = Swapped(x * x + z);
-  x = Swapped(x * x + y);
-  x = x * x + z;
-  const uint64_t s = Swapped(x);
-  return x ^ ((s * s + y) >> 32);
+  const uint64_t first = counter * k, x = Fourth(first, k), s = Swapped(x);
+  return x ^ ((s * s + first) >> 32);
 }
 
 constexpr double kRoot3 = 1.7320508075688772;
