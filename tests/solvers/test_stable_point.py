@@ -9,6 +9,7 @@ import pytest
 import scipy.linalg
 
 import perfcontrol as pc
+from perfcontrol.solvers.opening import secant_direction
 from tests.contracts.solver import SolverContract
 from tests.oracles.performative_prediction import stable_decision
 from tests.solvers.problems import MEAN, drifting, performative_prediction, strongly_performative
@@ -271,3 +272,14 @@ def test_stable_point_of_many_parameters_matches_that_of_few(expands, monkeypatc
         assert float(found.stats["residual"]) <= 1e-11
     finally:
         jax.clear_caches()  # programs made with these limits
+
+
+def test_secant_step_ends_at_the_fixed_point_of_an_affine_response_along_its_direction():
+    """Φ(M) = r M + b shrinks all along one direction alike: two points on it tell where it ends."""
+    rate, shift = 0.3, np.asarray(normal(0, 1, 2, 3))
+    fixed = shift / (1 - rate)
+    before = np.zeros_like(shift)
+    image_before = rate * before + shift
+    M, image = image_before, rate * image_before + shift
+    assert_close(M + secant_direction(M, image, before, image_before), fixed, 1e-12)
+    assert_close(secant_direction(before, image_before, before, image_before), shift, 1e-12)  # no step seen yet
