@@ -87,7 +87,10 @@ CASES = {
     "everything varies": everything_varies,
     "spheres from rest": spheres_from_rest,
     "spheres through rest": spheres_through_rest,
-    "no perturbation": lambda: plain_problem(perturbation=pc.NoPerturbation()),
+    "no perturbation, noise that reacts": lambda: plain_problem(
+        perturbation=pc.NoPerturbation(),
+        noise=lambda M: pc.Uniform(-1 - jnp.sum(M**2) * jnp.arange(N), np.arange(N)),
+    ),
     "diagonal": lambda: plain_problem(
         system=pc.LinearSystem.diagonal(0.5 * np.ones(N), np.ones(N)),
         gain=0,

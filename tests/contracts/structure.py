@@ -33,6 +33,14 @@ class StructureContract:
         assert structure.adjoint(Y).shape == theta.shape
         assert_close(jnp.sum(structure.lift(theta) * Y), jnp.sum(theta * structure.adjoint(Y)), 1e-12, 1e-4)
 
+    def test_product_matrix_is_that_of_the_product_between_lift_and_adjoint(self):
+        structure, (H, m, n) = self.structure(), self.shape
+        free = structure.free_shape(self.shape)
+        left, right, theta = normal(4, H * m, H * m), normal(5, n, n), normal(6, *free)
+        image = np.asarray(left) @ np.asarray(structure.lift(theta)).reshape(H * m, n) @ np.asarray(right)
+        expected = np.asarray(structure.adjoint(jnp.asarray(image.reshape(H, m, n)))).reshape(-1)
+        assert_close(structure.product_matrix(left, right, free) @ theta.reshape(-1), expected, 1e-12)
+
     def test_adjoint_after_lift_is_the_squared_norm(self):
         structure = self.structure()
         theta = normal(1, *structure.free_shape(self.shape))

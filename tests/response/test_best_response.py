@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 import perfcontrol as pc
+from perfcontrol.evaluate.world import world_of
 from perfcontrol.response import respond, response_jacobian, response_pushforward
+from perfcontrol.response.quadratic import quadratic
 from tests.evaluate.cases import affine_gradient, case, policies, random_psd, replaced, weights
 from tests.tools import assert_close, normal, tolerance
 
@@ -70,6 +72,21 @@ def test_separable_best_response_matches_dense_least_squares(name):
     problem = UNIQUE[name]()
     assert_close(answer(problem, DEPLOYED), dense_minimiser(problem, DEPLOYED), 1e-10)
     assert bool(respond(problem, DEPLOYED).unique)
+
+
+@pytest.mark.parametrize("varying", [False, True], ids=["constant", "varying"])
+@pytest.mark.parametrize("memory", [1, 3, T - 1])
+def test_hessian_is_how_the_gradient_grows(memory, varying):
+    lead = (T,) if varying else ()
+    problem = make(
+        pc.Gaussian(np.array([0.5, -1.0, 2.0]), random_psd(102, n)),
+        memory=memory,
+        system=pc.LinearSystem(0.4 * normal(111, *lead, n, n), normal(112, *lead, n, m)),
+        perturbation=pc.DensePerturbation(0.3, mean=0.1 * normal(113, *lead, n, n)),
+    )
+    policy = jnp.zeros(problem.policy_shape)
+    form = eqx.filter_jit(lambda problem, M: quadratic(problem, world_of(problem, M)))(problem, policy)
+    assert_close(form.matrix, affine_gradient(problem, policy)[1], 1e-12)
 
 
 @pytest.mark.parametrize("name", ENUMERABLE)

@@ -26,6 +26,30 @@ class TestRepeatedBlockOfThree(StructureContract):
         return pc.RepeatedBlock(3)
 
 
+class Swapped(pc.AbstractStructure):
+    """The block twice, the second time with its lags in the other order: nothing but what a structure must have."""
+
+    def lift(self, parameters):
+        return jnp.concatenate([parameters, parameters[::-1]], axis=1)
+
+    def adjoint(self, M):
+        first, second = jnp.split(M, 2, axis=1)
+        return first + second[::-1]
+
+    def free_shape(self, policy_shape):
+        H, m, n = policy_shape
+        return H, m // 2, n
+
+    @property
+    def norm(self):
+        return float(np.sqrt(2))
+
+
+class TestSwapped(StructureContract):
+    def structure(self):
+        return Swapped()
+
+
 def test_repeated_block_lifts_to_a_block_diagonal():
     theta = normal(1, 2, 1, 2)
     lifted = pc.RepeatedBlock(2).lift(theta)

@@ -11,16 +11,28 @@ from jaxtyping import Array, Key
 
 from perfcontrol._linalg import as_dense
 from perfcontrol.costs import QuadraticCost
-from perfcontrol.evaluate.draw import draw_noise
+from perfcontrol.evaluate.draw import draw_start
 from perfcontrol.kernel.library import TARGET, in_use
 from perfcontrol.perturbations import DenseDraws, DensePerturbation, NoPerturbation
 from perfcontrol.perturbations.counted import Counted
 from perfcontrol.perturbations.white_draws import WhiteDraws
 from perfcontrol.problem import PerformativeProblem
+from perfcontrol.random_keys import is_fast
+from perfcontrol.random_vectors import Rademacher, Uniform
 
 REGISTER = 64  # bytes of one number of all paths that the kernel works on together, `Lanes` in numbers.h
-NONE, MATRICES, SIGNS, UNIFORM, PRODUCTS, NORMAL = range(6)  # `Reaction` in arguments.h
+NONE, MATRICES, SIGNS, UNIFORM, PRODUCTS, NORMAL = range(6)  # `Source` in arguments.h
 Plain = Callable[[PerformativeProblem, Array, Array, Key[Array, ""]], Array]
+
+
+class _Noise(NamedTuple):
+    """The noise as the kernel takes it: given, or drawn there about its centre."""
+
+    kind: int
+    key: Array
+    w: Array | None = None  # (T, n)
+    scale: Array | None = None  # (n,)
+    centre: Array | None = None  # (n,)
 
 
 class _Reaction(NamedTuple):
@@ -80,7 +92,8 @@ def _drawn(problem: PerformativeProblem, deployed: Array, key: Key[Array, ""]) -
 
 
 def _called(problem: PerformativeProblem, policy: Array, deployed: Array, key: Key[Array, ""], gradient: bool) -> Array:
-    x0, w, perturbation_key = draw_noise(problem, deployed, key)
+    x0, noise_key, perturbation_key = draw_start(problem, deployed, key)
+    noise = _noise(problem, deployed, noise_key)
     reaction = _reaction(problem, deployed, perturbation_key)
     Q, R, cross = problem.cost.weights(problem.horizon)  # type: ignore[attr-defined]
     system, cost, dtype = problem.system, problem.cost, policy.dtype
@@ -98,11 +111,25 @@ def _called(problem: PerformativeProblem, policy: Array, deployed: Array, key: K
     scale = None if reaction.scale is None else reaction.scale[:, None]
     drawn = [given(scale, 1), given(reaction.location, 2), given(reaction.matrices, 2)]
     drawn += [given(array, 1) for array in (reaction.ahead, reaction.back, reaction.rest)]
+    noise_law = [jnp.zeros(0, dtype) if array is None else array for array in (noise.scale, noise.centre)]
     answers = jax.ShapeDtypeStruct((), dtype), jax.ShapeDtypeStruct(policy.shape if gradient else (0,), dtype)
     call = jax.ffi.ffi_call(TARGET, answers, vmap_method="expand_dims")
-    options = {"reaction": np.int64(reaction.kind), "redrawn": reaction.each, "gradient": gradient}
-    path_cost, by_policy = call(*matrices, *targets, policy, x0, w, *drawn, reaction.key, **options)
+    options = {"horizon": np.int64(problem.horizon), "redrawn": reaction.each, "gradient": gradient}
+    options |= {"reaction": np.int64(reaction.kind), "noise": np.int64(noise.kind)}
+    given_noise, keys = given(noise.w, 1), (reaction.key, noise.key)
+    path_cost, by_policy = call(*matrices, *targets, policy, x0, given_noise, *drawn, *noise_law, *keys, **options)
     return by_policy if gradient else path_cost
+
+
+def _noise(problem: PerformativeProblem, deployed: Array, key: Key[Array, ""]) -> _Noise:
+    law, dtype = problem.noise_under(deployed), deployed.dtype
+    fast = is_fast(key) and law.mean.dtype == dtype
+    if fast and type(law) is Rademacher:
+        return _Noise(SIGNS, jax.random.key_data(key), scale=jnp.atleast_1d(law.scale), centre=law.mean)
+    if fast and type(law) is Uniform:
+        scale = jnp.atleast_1d(law.high - law.low) / np.sqrt(12)
+        return _Noise(UNIFORM, jax.random.key_data(key), scale=scale.astype(dtype), centre=law.mean)
+    return _Noise(NONE, jnp.zeros(4, np.uint32), w=law.sample(key, problem.horizon).astype(dtype))
 
 
 def _reaction(problem: PerformativeProblem, deployed: Array, key: Key[Array, ""]) -> _Reaction:

@@ -72,29 +72,38 @@ def sustained_form(world: World, memory: int) -> Array:
     """(H m, H m): the quadratic form that constant feedforwards ṽ_i, held from time i on, meet (i = 1..H)."""
     if isinstance(world, StationaryWorld):  # in the long run the lags do not differ
         return jnp.tile(world.sustained(), (memory, memory))
-    length, m = len(world.Lambda) + 1, world.B.shape[-1]
-    size = memory * m
-    active = (jnp.arange(length)[:, None] >= jnp.arange(1, memory + 1)).astype(world.Lambda.dtype)  # (T+1, H)
-    B = as_dense(along_time(world.B, 2, length - 1))
+    T, m = len(world.Lambda), world.B.shape[-1]
     varying = world.F.ndim == 3
 
+    def back(Y: Array, step: Any) -> tuple[Array, Array]:
+        F_t, D_t = step
+        Y = D_t + Y @ (F_t if varying else world.F)
+        return Y, Y
+
+    # Y_t = D_t + Y_{t+1} F_t: what a state at time t couples to from then on.
+    _, Y = jax.lax.scan(back, world.D[T], (world.F if varying else None, world.D[:T]), reverse=True)
+    Y = jnp.concatenate([Y, world.D[T:]])
+    B = as_dense(world.B)
+    later = tail_sums(Y[1:] @ B, memory, T) if B.ndim == 3 else tail_sums(Y[1:], memory, T) @ B  # pushes from a on
+    latest = jnp.maximum(*jnp.indices((memory, memory)))
+    coupled = later[latest].transpose(0, 2, 1, 3)  # (a, m, b, m): at times t >= a, by what is held from b on
+    if memory > 1:
+        coupled = coupled + _pushed_before(world, Y, memory)
+    coupled = coupled.reshape(memory * m, memory * m)
+    held = tail_sums(world.S, memory, T + 1)[latest]
+    return coupled + coupled.T + held.transpose(0, 2, 1, 3).reshape(memory * m, memory * m)
+
+
+def _pushed_before(world: CostToGo, Y: Array, memory: int) -> Array:
+    """Y_a X_a, (H, m, H, m), where X_a is the state at time a that feedforwards held from b < a on have led to."""
+    n, m = world.B.shape[-2:]
+    F, B = (as_dense(along_time(matrix, 2, len(world.Lambda)))[1:memory] for matrix in (world.F, world.B))
+    held = (jnp.arange(1, memory)[:, None] >= jnp.arange(1, memory + 1)).astype(Y.dtype)
+
     def advance(X: Array, step: Any) -> tuple[Array, Array]:
-        """X_t, the state that the columns of ṽ have led to, goes on; D_t X_t is what it couples to."""
-        F_t, B_t, D_t, active_t = step
-        push = (B_t[:, None, :] * active_t[:, None]).reshape(-1, size)
-        return (F_t if varying else world.F) @ X + push, D_t @ X
+        F_t, B_t, held_t = step
+        X = F_t @ X + (B_t[:, None, :] * held_t[:, None]).reshape(n, -1)
+        return X, X
 
-    def add(carry: tuple[Array, Array], step: Any) -> tuple[tuple[Array, Array], None]:
-        X, coupled = advance(carry[0], step)
-        return (X, carry[1] + coupled), None
-
-    steps = (world.F if varying else None, B, world.D[:-1], active[:-1])
-    early, late = (
-        jax.tree.map(lambda leaf, part=part: leaf[part], steps) for part in (slice(memory), slice(memory, None))
-    )
-    X, single = jax.lax.scan(advance, jnp.zeros((B.shape[1], size), B.dtype), early)
-    (X, rest), _ = jax.lax.scan(add, (X, jnp.zeros_like(single[0])), late)
-    parts = jnp.concatenate([single, (rest + world.D[-1] @ X)[None]])  # all that t >= H adds in one
-    coupled = tail_sums(parts, memory, memory + 1).reshape(size, size)
-    held = tail_sums(world.S, memory, length)[jnp.maximum(*jnp.indices((memory, memory)))]
-    return coupled + coupled.T + held.transpose(0, 2, 1, 3).reshape(size, size)
+    _, X = jax.lax.scan(advance, jnp.zeros((n, memory * m), Y.dtype), (F, B, held))
+    return jnp.pad(Y[2 : memory + 1] @ X, ((1, 0), (0, 0), (0, 0))).reshape(memory, m, memory, m)

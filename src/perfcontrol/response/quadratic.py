@@ -117,21 +117,13 @@ def hessian_matrix(problem: PerformativeProblem, world: World, linear: Array) ->
     """The Hessian in the free parameters (p, p)."""
     size = linear.size
     if stationary(world):
-        H, m, _ = problem.lifted_shape
-        w = world.noise_mean
-        curvature = impulse_form(world, H).G, sustained_form(world, H)
-        blocks = jnp.stack(curvature).reshape(2, H, m, H, m)
-        right = jnp.stack([world.noise_covariance, jnp.outer(w, w)])
+        of, shape, w = problem.structure.product_matrix, problem.policy_shape, world.noise_mean
+        driven = of(impulse_form(world, problem.memory).G, world.noise_covariance, shape)
+        held = of(sustained_form(world, problem.memory), jnp.outer(w, w), shape)
+        return symmetrise(2 * (driven + held))
 
-        def column(direction: Array) -> Array:
-            V = problem.structure.lift(direction.reshape(linear.shape))
-            image = jnp.einsum("kimjl,jln,kno->imo", blocks, V, right, optimize="optimal")
-            return 2 * problem.structure.adjoint(image).reshape(-1)
-
-    else:
-
-        def column(direction: Array) -> Array:
-            return (weigh(problem, world, direction.reshape(linear.shape))[1] - linear).reshape(-1)
+    def column(direction: Array) -> Array:
+        return (weigh(problem, world, direction.reshape(linear.shape))[1] - linear).reshape(-1)
 
     return symmetrise(jax.lax.map(column, jnp.eye(size, dtype=linear.dtype), batch_size=min(64, size)))
 

@@ -14,7 +14,8 @@
 
 namespace perfcontrol {
 
-enum Reaction : int64_t { kNone = 0, kMatrices = 1, kSigns = 2, kUniform = 3, kProducts = 4, kNormal = 5 };
+// What the perturbations are drawn from, and the noise: that is kNone where it is given.
+enum Source : int64_t { kNone = 0, kMatrices = 1, kSigns = 2, kUniform = 3, kProducts = 4, kNormal = 5 };
 
 struct Sizes {
   size_t n, m, memory, horizon;
@@ -81,11 +82,11 @@ struct Series {
 };
 
 // In the order in which they come: axes of one path, and whether the first of them is time.
-constexpr size_t kArguments = 18;
-constexpr size_t kInner[kArguments] = {3, 3, 3, 3, 3, 3, 2, 2, 3, 1, 2, 2, 3, 3, 2, 2, 2, 1};
-constexpr bool kTimed[kArguments] = {true,  true, true, true, true, true, true, true, false,
-                                     false, true, true, true, true, true, true, true, false};
-constexpr size_t kPolicy = 8, kNoise = 10, kKey = 17;
+constexpr size_t kArguments = 21;
+constexpr size_t kInner[kArguments] = {3, 3, 3, 3, 3, 3, 2, 2, 3, 1, 2, 2, 3, 3, 2, 2, 2, 1, 1, 1, 1};
+constexpr bool kTimed[kArguments] = {true, true, true, true, true, true, true,  true,  false, false, true,
+                                     true, true, true, true, true, true, false, false, false, false};
+constexpr size_t kPolicy = 8, kKey = 19, kNoiseKey = 20;
 
 template <typename T, bool kTogether>
 struct Given {
@@ -93,17 +94,24 @@ struct Given {
   using Part = Series<T, kTogether>;
 
   Part A, B, K, Q, R, N, state_target, input_target, M, x0, w, scale, location, matrices, ahead, back, rest;
-  std::array<Stream, kLanes> streams;
+  Part noise_scale, noise_centre;
+  std::array<Stream, kLanes> streams, noise_streams;
 
   Given(const std::vector<Argument>& all, const Places<kLanes>& paths)
       : A(all[0], paths), B(all[1], paths), K(all[2], paths), Q(all[3], paths), R(all[4], paths), N(all[5], paths),
         state_target(all[6], paths), input_target(all[7], paths), M(all[kPolicy], paths), x0(all[9], paths),
-        w(all[kNoise], paths), scale(all[11], paths), location(all[12], paths), matrices(all[13], paths),
-        ahead(all[14], paths), back(all[15], paths), rest(all[16], paths) {
+        w(all[10], paths), scale(all[11], paths), location(all[12], paths), matrices(all[13], paths),
+        ahead(all[14], paths), back(all[15], paths), rest(all[16], paths), noise_scale(all[17], paths),
+        noise_centre(all[18], paths), streams(Streams(all[kKey], paths)), noise_streams(Streams(all[kNoiseKey], paths)) {}
+
+ private:
+  static std::array<Stream, kLanes> Streams(const Argument& keys, const Places<kLanes>& paths) {
+    std::array<Stream, kLanes> streams;
     for (size_t lane = 0; lane < kLanes; ++lane) {
-      const auto* key = reinterpret_cast<const uint32_t*>(all[kKey].Of(paths[lane]));
+      const auto* key = reinterpret_cast<const uint32_t*>(keys.Of(paths[lane]));
       streams[lane] = {uint64_t{key[0]} << 32 | key[1], uint64_t{key[2]} << 32 | key[3]};
     }
+    return streams;
   }
 };
 

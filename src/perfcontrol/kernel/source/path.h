@@ -27,9 +27,10 @@ class Path {
   using Number = typename Kind<T, kTogether>::Number;
   static constexpr size_t kLanes = Kind<T, kTogether>::kLanes;
 
-  Path(Sizes sizes, Reaction reaction, bool redrawn, bool gradient)
+  Path(Sizes sizes, Source reaction, Source noise, bool redrawn, bool gradient)
       : n_(sizes.n), m_(sizes.m), pn_(Kind<T, kTogether>::Padded(n_)), pm_(Kind<T, kTogether>::Padded(m_)),
-        memory_(sizes.memory), horizon_(sizes.horizon), reaction_(reaction), redrawn_(redrawn),
+        memory_(sizes.memory), horizon_(sizes.horizon), reaction_(reaction), noise_(noise),
+        redrawn_(redrawn),
         A_(n_, n_, false), B_(n_, m_, false), K_(m_, n_, false), Q_(n_, n_, false), R_(m_, m_, false),
         N_(n_, m_, false), AT_(n_, n_, true), BT_(n_, m_, true), KT_(m_, n_, true), NT_(n_, m_, true),
         location_(n_, n_, false), locationT_(n_, n_, true), M_(memory_, Matrix<T, kTogether>(m_, n_, false)),
@@ -39,7 +40,7 @@ class Path {
     const bool drawn = reaction == kSigns || reaction == kUniform || reaction == kNormal;
     entries_ = reaction == kNormal ? 2 * n_ : n_ * pn_;
     held_ = drawn && gradient && horizon_ * entries_ * sizeof(Number) <= kHeld;
-    if (drawn) flat_.resize(n_ * n_);
+    flat_.resize(std::max(drawn ? n_ * n_ : 0, noise != kNone && pn_ > n_ ? horizon_ * n_ : 0));
     const size_t room = drawn || reaction == kMatrices ? (held_ ? horizon_ : 1) * entries_ : 0;
     if (Z_.size() < room) Z_.resize(room);
   }
@@ -48,6 +49,7 @@ class Path {
   Number Ahead(const Given<T, kTogether>& g) {
     Number cost{};
     for (size_t i = 0; i < n_; ++i) x_[i] = g.x0.At(0, i);
+    MakeNoise(g);
     for (size_t t = 0; t <= horizon_; ++t) {
       const Number* x = &x_[t * pn_];
       Number *by_x = &by_x_[kept_ * t * pn_], *by_u = &by_u_[kept_ * t * pm_], *u = u_.data();
@@ -68,8 +70,8 @@ class Path {
       }
       cost += Dot<T, kTogether>(dx_.data(), by_x, pn_) + Dot<T, kTogether>(du_.data(), by_u, pm_);
       if (t == horizon_) break;
-      Number *following = &x_[(t + 1) * pn_], *w = &w_[t * pn_];
-      for (size_t i = 0; i < n_; ++i) following[i] = w[i] = g.w.At(t, i);
+      Number* following = &x_[(t + 1) * pn_];
+      std::copy_n(&w_[t * pn_], pn_, following);
       A_.AddTo(g.A, t, x, following);
       B_.AddTo(g.B, t, u, following);
       React(g, t, x, following);
@@ -105,6 +107,28 @@ class Path {
   }
 
  private:
+  static Law LawOf(Source source) {
+    return source == kSigns ? Law::kSigns : source == kUniform ? Law::kUniform : Law::kNormal;
+  }
+
+  // w_t: as given, or drawn about its centre.
+  void MakeNoise(const Given<T, kTogether>& g) {
+    T* raw = pn_ == n_ ? reinterpret_cast<T*>(w_.data()) : flat_.data();  // in its place, unless zeros stand between
+    if (noise_ != kNone) Fill<T, kLanes>(LawOf(noise_), g.noise_streams, 0, horizon_ * n_, raw);
+    for (size_t t = 0; t < horizon_; ++t) {
+      for (size_t i = 0; i < n_; ++i) {
+        Number w;
+        if (noise_ == kNone) {
+          w = g.w.At(t, i);
+        } else {
+          std::memcpy(&w, raw + (t * n_ + i) * kLanes, sizeof(w));
+          w = g.noise_centre.At(0, i) + g.noise_scale.At(0, i) * w;
+        }
+        w_[t * pn_ + i] = w;
+      }
+    }
+  }
+
   // Z_t, by rows; of normal entries the numbers that its two products are made of.
   const Number* Drawn(const Given<T, kTogether>& g, size_t t, bool again) {
     Number* Z = Z_.data() + (held_ ? t * entries_ : 0);
@@ -120,10 +144,9 @@ class Path {
       for (Stream& stream : streams) stream = stream.FoldIn(t);
     }
     const bool whole = kTogether || reaction_ == kNormal;  // as they come, or row by row with zeros behind
-    const Law law = reaction_ == kSigns ? Law::kSigns : reaction_ == kUniform ? Law::kUniform : Law::kNormal;
     const size_t count = reaction_ == kNormal ? 2 * n_ : n_ * n_;
     T* to = whole ? reinterpret_cast<T*>(Z) : flat_.data();
-    Fill<T, kLanes>(law, streams, redrawn_ ? 0 : t * count, count, to);
+    Fill<T, kLanes>(LawOf(reaction_), streams, redrawn_ ? 0 : t * count, count, to);
     if constexpr (!kTogether) {
       for (size_t i = 0; i < n_ && !whole; ++i) {
         std::copy_n(flat_.data() + i * n_, n_, Z + i * pn_);
@@ -206,7 +229,7 @@ class Path {
   }
 
   size_t n_, m_, pn_, pm_, memory_, horizon_, entries_ = 0;
-  Reaction reaction_;
+  Source reaction_, noise_;
   bool redrawn_, held_ = false;
   Matrix<T, kTogether> A_, B_, K_, Q_, R_, N_, AT_, BT_, KT_, NT_, location_, locationT_;
   std::vector<Matrix<T, kTogether>> M_;

@@ -19,7 +19,7 @@ struct Work {
   const std::vector<Argument>& arguments;
   const std::vector<size_t>& axes;
   Sizes sizes;
-  Reaction reaction;
+  Source reaction, noise;
   bool redrawn, gradient;
 
   std::vector<size_t> Place(size_t index) const {
@@ -35,7 +35,7 @@ void Run(const Work& work, size_t first, size_t last, T* costs, T* gradients) {
   if (first == last) return;
   constexpr size_t kLanes = Kind<T, kTogether>::kLanes;
   const auto [n, m, memory, horizon] = work.sizes;
-  Path<T, kTogether> path(work.sizes, work.reaction, work.redrawn, work.gradient);
+  Path<T, kTogether> path(work.sizes, work.reaction, work.noise, work.redrawn, work.gradient);
   for (; first < last; first += kLanes) {
     Places<kLanes> places;
     for (size_t lane = 0; lane < kLanes; ++lane) places[lane] = work.Place(std::min(first + lane, last - 1));
@@ -66,8 +66,8 @@ void RunAll(const Work& work, Answer cost, Answer gradients) {
   Run<T, false>(work, count - alone, count, costs, out);
 }
 
-ffi::Error Paths(ffi::RemainingArgs buffers, Answer cost, Answer gradients, int64_t reaction, bool redrawn,
-                 bool gradient) {
+ffi::Error Paths(ffi::RemainingArgs buffers, Answer cost, Answer gradients, int64_t reaction, int64_t noise,
+                 int64_t horizon, bool redrawn, bool gradient) {
   const ffi::DataType type = cost->element_type();
   if (type != ffi::DataType::F32 && type != ffi::DataType::F64) {
     return ffi::Error::InvalidArgument("neither float32 nor float64");
@@ -76,18 +76,20 @@ ffi::Error Paths(ffi::RemainingArgs buffers, Answer cost, Answer gradients, int6
   const std::vector<size_t> axes(cost->dimensions().begin(), cost->dimensions().end());
   std::vector<Argument> arguments;
   Sizes sizes{};
+  sizes.horizon = horizon;
   for (size_t i = 0; i < kArguments; ++i) {
     const auto buffer = buffers.get<ffi::AnyBuffer>(i);
+    const bool key = i == kKey || i == kNoiseKey;
     if (buffer.has_error() || buffer->dimensions().size() != axes.size() + kInner[i] ||
-        buffer->element_type() != (i == kKey ? ffi::DataType::U32 : type)) {
+        buffer->element_type() != (key ? ffi::DataType::U32 : type)) {
       return ffi::Error::InvalidArgument("argument " + std::to_string(i) + " does not fit");
     }
     const auto dims = buffer->dimensions();
     if (i == kPolicy) sizes.memory = dims[axes.size()], sizes.m = dims[axes.size() + 1], sizes.n = dims[axes.size() + 2];
-    if (i == kNoise) sizes.horizon = dims[axes.size()];
-    arguments.emplace_back(*buffer, kInner[i], i == kKey ? 4 : ffi::ByteWidth(type), kTimed[i]);
+    arguments.emplace_back(*buffer, kInner[i], key ? 4 : ffi::ByteWidth(type), kTimed[i]);
   }
-  const Work work{arguments, axes, sizes, static_cast<Reaction>(reaction), redrawn, gradient};
+  const auto drawn = static_cast<Source>(reaction), noisy = static_cast<Source>(noise);
+  const Work work{arguments, axes, sizes, drawn, noisy, redrawn, gradient};
   try {
     if (type == ffi::DataType::F32) {
       RunAll<float>(work, cost, gradients);
@@ -109,5 +111,7 @@ XLA_FFI_DEFINE_HANDLER_SYMBOL(PerfcontrolPaths, perfcontrol::Paths,
                                   .Ret<xla::ffi::AnyBuffer>()
                                   .Ret<xla::ffi::AnyBuffer>()
                                   .Attr<int64_t>("reaction")
+                                  .Attr<int64_t>("noise")
+                                  .Attr<int64_t>("horizon")
                                   .Attr<bool>("redrawn")
                                   .Attr<bool>("gradient"));

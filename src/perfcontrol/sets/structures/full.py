@@ -1,5 +1,6 @@
 """No structure."""
 
+import jax.numpy as jnp
 from jaxtyping import Array
 
 from perfcontrol.sets.structures.base import AbstractStructure
@@ -16,6 +17,9 @@ class FullStructure(AbstractStructure):
 
     def free_shape(self, policy_shape: tuple[int, int, int]) -> tuple[int, int, int]:
         return policy_shape
+
+    def product_matrix(self, left: Array, right: Array, shape: tuple[int, int, int]) -> Array:
+        return jnp.kron(left, right.T)
 
     @property
     def norm(self) -> float:

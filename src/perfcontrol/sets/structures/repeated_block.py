@@ -43,6 +43,11 @@ class RepeatedBlock(AbstractStructure):
             )
         return H, m // self.count, n // self.count
 
+    def product_matrix(self, left: Array, right: Array, shape: tuple[int, int, int]) -> Array:
+        H, m, n = shape
+        left, right = left.reshape(H, self.count, m, H, self.count, m), right.reshape(self.count, n, self.count, n)
+        return jnp.einsum("haigbj,blak->hikgjl", left, right).reshape(H * m * n, H * m * n)
+
     @property
     def norm(self) -> float:
         return math.sqrt(self.count)
