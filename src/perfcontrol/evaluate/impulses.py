@@ -81,8 +81,8 @@ def impulse_form(world: World, memory: int) -> ImpulseForm:
     if isinstance(world, StationaryWorld):
         (X, Y), a = world.chains(memory), world.Lambda
     else:
-        ones = jnp.ones(len(world.Lambda), world.Lambda.dtype)
-        (X, Y), a = _chain_tails(world, memory), jnp.tensordot(ones, world.Lambda, 1)
+        (X, Y), Lambda = _chain_tails(world, memory), world.Lambda
+        a = Lambda[0] + tail_sums(Lambda, memory, len(Lambda))[0]  # sums that the chains need as well
     row, column = jnp.meshgrid(jnp.arange(memory), jnp.arange(memory), indexing="ij")
     blocks = X[jnp.abs(row - column), jnp.maximum(row, column)]
     blocks = jnp.where((row >= column)[..., None, None], blocks, transpose(blocks))
