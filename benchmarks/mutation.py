@@ -4,6 +4,11 @@ Draws small faults (a sign, a comparison, a constant, a factor) all over the roo
 runs the tests of that room until the first failure. Prints the share of faults that were noticed and every one that
 was not: some of those change nothing that anybody could see, each is worth a look. Fails where the share is below
 `--least` percent.
+
+First each file of tests runs once without a fault, to see which lines it executes. A file that never executes the
+faulty line cannot notice the fault and is left out. The unit is the file, in a process of its own: JAX traces a
+function once, so that which test of a file executes a line depends on the tests before. The tests that did are only
+tried first.
 """
 
 import argparse
@@ -16,14 +21,18 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+import time
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from itertools import accumulate
 from pathlib import Path
 from typing import NamedTuple
 
+from coverage import CoverageData
+
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "src" / "perfcontrol"
-TESTS = {  # the tests of a room, those that fail soonest first
+TESTS = {  # the tests of a room
     "evaluate": ["tests/evaluate", "tests/response", "tests/test_properties.py"],
     "response": ["tests/response", "tests/solvers"],
     "solvers": ["tests/solvers"],
@@ -34,13 +43,18 @@ TESTS = {  # the tests of a room, those that fail soonest first
     "costs": ["tests/costs", "tests/evaluate"],
     "theory": ["tests/theory"],
 }
-PATIENCE = 1800  # seconds of a core after which a fault counts as noticed: it has made something endless
+FIRST = 60.0  # seconds of tests that are tried before whole files
+PATIENCE = 10  # times what tests take without a fault: a fault compiles anew, one that takes longer is endless
+LONGEST = 1800  # seconds of a core that a file of tests may take without a fault
+UNDECIDED = (0, 4, 5)  # passed; tests that are no longer there, their names having changed with the fault; none
 MANY = 50  # of so many samples, steps or rows one more makes no difference
 SWAPS: dict[type, type] = {
     ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult,
     ast.Lt: ast.GtE, ast.GtE: ast.Lt, ast.Gt: ast.LtE, ast.LtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
     ast.And: ast.Or, ast.Or: ast.And, ast.BitAnd: ast.BitOr, ast.BitOr: ast.BitAnd,
 }  # fmt: skip
+
+Result = subprocess.CompletedProcess[str]
 
 
 class Fault(NamedTuple):
@@ -117,34 +131,112 @@ def with_fault(source: str, fault: Fault) -> str:
     return ast.unparse(tree)
 
 
-def _tests(file: Path, room: str) -> list[str]:
-    """The tests of the room, those named after the file first."""
-    folders = [ROOT / name for name in TESTS[room]]
-    near = [path for folder in folders for path in sorted(folder.rglob(f"test_{file.stem}.py"))]
-    return [*map(str, near), *TESTS[room]]
+def _files(room: str) -> list[str]:
+    """The files of tests of a room."""
+    places = [ROOT / name for name in TESTS[room]]
+    files = [file for place in places for file in (sorted(place.rglob("test_*.py")) if place.is_dir() else [place])]
+    return [str(file.relative_to(ROOT)) for file in files]
 
 
-def _failure(room: str, file: Path, source: str | None) -> str | None:
-    """The first test of the room that fails with `source` in place of the file; None where all pass."""
+def statement(source: str, line: int) -> tuple[set[int], bool]:
+    """The lines of the statement around a line, without those of statements inside it; whether an import runs it."""
+    statements = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.stmt)]
+    *outer, own = (node for node in statements if node.lineno <= line <= (node.end_lineno or 0))
+    inner = [node for node in ast.walk(own) if isinstance(node, ast.stmt) and node is not own]
+    lines = _lines(own).difference(*map(_lines, inner)) | {own.lineno}
+    return lines, not any(isinstance(node, ast.FunctionDef) for node in outer)
+
+
+def _lines(node: ast.stmt) -> set[int]:
+    decorators = getattr(node, "decorator_list", [])
+    return set(range(min(part.lineno for part in (node, *decorators)), (node.end_lineno or 0) + 1))
+
+
+def _run(arguments: Iterable[str], seconds: float, fault: tuple[Path, str] | None = None, **environment: str) -> Result:
+    """Run tests on a copy of the package, which may have a fault in it, for so many seconds of a core at most."""
     with tempfile.TemporaryDirectory() as folder:
         package = Path(folder) / "src" / "perfcontrol"
         shutil.copytree(PACKAGE, package, ignore=shutil.ignore_patterns("__pycache__"))
-        if source is not None:
-            (Path(folder) / file).write_text(source, encoding="utf-8")
-        environment = os.environ | {"PYTHONPATH": str(package.parent), "PYTHONDONTWRITEBYTECODE": "1"}
-        limited = ["bash", "-c", f'ulimit -t {PATIENCE}; exec "$@"', "-"]
-        command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *_tests(file, room)]
-        run = subprocess.run(limited + command, cwd=ROOT, env=environment, capture_output=True, text=True)
-        if run.returncode == 0:
-            return None
-        found = re.search(r"^(?:FAILED|ERROR) (\S+)", run.stdout, re.MULTILINE)
-        return found[1] if found else f"exit status {run.returncode}"
+        if fault is not None:
+            (Path(folder) / fault[0]).write_text(fault[1], encoding="utf-8")
+        listed = Path(folder) / "arguments"  # in a file: there may be thousands
+        listed.write_text("\n".join(arguments), encoding="utf-8")
+        environment = os.environ | {"PYTHONPATH": str(package.parent), "PYTHONDONTWRITEBYTECODE": "1"} | environment
+        limited = ["bash", "-c", f'ulimit -t {seconds:.0f}; exec "$@"', "-"]
+        command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", f"@{listed}"]
+        return subprocess.run(limited + command, cwd=ROOT, env=environment, capture_output=True, text=True)
 
 
-def noticed(fault: Fault, room: str) -> str | None:
-    """The test of the room that fails with the fault in a copy of the package; None where it survives."""
+def _failure(run: Result) -> str | None:
+    """The first test that failed in a run; None where all passed."""
+    if run.returncode == 0:
+        return None
+    found = re.search(r"^(?:FAILED|ERROR) (\S+)", run.stdout, re.MULTILINE)
+    return found[1] if found else f"exit status {run.returncode}"
+
+
+class Reach(NamedTuple):
+    """What a file of tests does without a fault: seconds it takes, those of each test, who executes which lines."""
+
+    file: str
+    seconds: float
+    tests: dict[str, float]
+    lines: dict[str, dict[int, list[str]]]
+
+
+def reach(file: str) -> Reach:
+    """Run a file of tests without a fault, which it has to pass, and see what it executes."""
+    start = time.perf_counter()
+    with tempfile.TemporaryDirectory() as folder:
+        kept = str(Path(folder) / "coverage")
+        observed = ["--cov", "--cov-context=test", "--cov-report=", "-vv", "--durations=0", "--durations-min=0", file]
+        run = _run(observed, LONGEST, COVERAGE_FILE=kept)
+        failing = _failure(run)
+        if failing:
+            sys.exit(f"{failing} fails without a fault")
+        data = CoverageData(kept)
+        data.read()
+        lines = {name.rpartition("/src/")[2]: data.contexts_by_lineno(name) for name in data.measured_files()}
+    tests: dict[str, float] = {}
+    for seconds, test in re.findall(r"^([\d.]+)s (?:setup|call|teardown) +(.+)$", run.stdout, re.MULTILINE):
+        tests[test] = tests.get(test, 0.0) + float(seconds)
+    return Reach(file, time.perf_counter() - start, tests, lines)
+
+
+def order(fault: Fault, source: str, reaches: Iterable[Reach]) -> tuple[list[str], list[Reach]]:
+    """The tests to try first, and every file that executes the statement with the fault; the cheapest ones first."""
+    lines, imported = statement(source, fault.line)
+    module = str(fault.file.relative_to("src"))
+    files = [file for file in reaches if not lines.isdisjoint(file.lines.get(module, {}))]
+    seconds: dict[str, float] = {}
+    for file in files:
+        executed = file.lines[module]
+        # What an import runs is put down to whichever test came first: those that use the module say more.
+        for line in executed if imported else lines & executed.keys():
+            tests = {context.rpartition("|")[0] for context in executed[line]} - {""}
+            seconds |= {test: file.tests[test] for test in tests}
+    cheapest = sorted(seconds, key=lambda test: seconds[test])
+    first = [
+        test
+        for test, spent in zip(cheapest, accumulate(seconds[test] for test in cheapest), strict=True)
+        if spent <= FIRST
+    ]
+    # By file: between two files the compiled programs are dropped.
+    return sorted(first, key=lambda test: test.partition("::")[0]), sorted(files, key=lambda file: file.seconds)
+
+
+def noticed(fault: Fault, reaches: Iterable[Reach]) -> str | None:
+    """The first test found to fail with the fault in a copy of the package; None where it survives."""
     source = (ROOT / fault.file).read_text(encoding="utf-8")
-    return _failure(room, fault.file, with_fault(source, fault))
+    first, files = order(fault, source, reaches)
+    faulty = (fault.file, with_fault(source, fault))
+    if first:
+        run = _run(first, PATIENCE * FIRST, faulty)
+        if run.returncode not in UNDECIDED:
+            return _failure(run)
+    if not files:
+        return None
+    return _failure(_run([file.file for file in files], PATIENCE * sum(file.seconds for file in files), faulty))
 
 
 def main() -> None:
@@ -159,21 +251,29 @@ def main() -> None:
     pool = [(fault, room) for room in arguments.rooms for fault in faults(room)]
     drawn = random.Random(arguments.seed).sample(pool, min(arguments.count, len(pool)))
     print(f"{len(drawn)} of {len(pool)} faults", flush=True)
+    begun = time.perf_counter()
     with ThreadPoolExecutor(arguments.workers) as workers:
-        rooms = sorted({room for _, room in drawn})
-        for room, failing in zip(rooms, workers.map(lambda room: _failure(room, Path(), None), rooms), strict=True):
-            if failing:
-                sys.exit(f"{room}: {failing} fails without a fault")
+        tests = {room: _files(room) for room in sorted({room for _, room in drawn})}
+        reaches = {file.file: file for file in workers.map(reach, sorted(set().union(*tests.values())))}
+        print(f"{len(reaches)} files of tests without a fault: {time.perf_counter() - begun:.0f} s", flush=True)
+
+        def judged(item: tuple[Fault, str]) -> tuple[str | None, float]:
+            start = time.perf_counter()
+            return noticed(item[0], [reaches[file] for file in tests[item[1]]]), time.perf_counter() - start
+
         verdicts = []
-        for (fault, room), test in zip(drawn, workers.map(lambda item: noticed(*item), drawn), strict=True):
+        for (fault, room), (test, seconds) in zip(drawn, workers.map(judged, drawn), strict=True):
             verdicts.append((room, test is not None))
-            print(f"{fault.file}:{fault.line} {fault.kind}: {test or 'SURVIVED'}", flush=True)
+            print(f"{fault.file}:{fault.line} {fault.kind}: {test or 'SURVIVED'} ({seconds:.0f} s)", flush=True)
     for room in arguments.rooms:
         own = [found for name, found in verdicts if name == room]
         if own:
             print(f"{room}: {sum(own)} of {len(own)}")
+    minutes = (time.perf_counter() - begun) / 60
     share = sum(found for _, found in verdicts) / len(verdicts)
-    print(f"noticed: {sum(found for _, found in verdicts)} of {len(verdicts)}, {100 * share:.1f} %")
+    print(
+        f"noticed: {sum(found for _, found in verdicts)} of {len(verdicts)}, {100 * share:.1f} %, in {minutes:.0f} min"
+    )
     sys.exit(100 * share < arguments.least)
 
 
