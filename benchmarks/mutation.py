@@ -172,7 +172,7 @@ def _failure(run: Result) -> str | None:
     """The first test that failed in a run; None where all that are there passed."""
     if run.returncode in (0, NO_TESTS):
         return None
-    found = re.search(r"^(?:FAILED|ERROR) (\S+)", run.stdout, re.MULTILINE)
+    found = re.search(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", run.stdout, re.MULTILINE)
     return found[1] if found else f"exit status {run.returncode}"
 
 
