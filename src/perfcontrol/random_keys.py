@@ -63,6 +63,7 @@ def _words(a: Array, b: Array) -> UInt32[Array, "*shape 4"]:
 
 
 @_in_64_bits
+@jax.jit
 def _seed(seed: Any) -> UInt32[Array, "4"]:
     a = _mix(lax.convert_element_type(seed, np.uint64) + FOLD)
     return _words(a, _mix(a + FOLD))
@@ -139,6 +140,12 @@ def fast_key(seed: Any) -> Key[Array, ""]:
     if not fits or (whole.dtype == np.uint64 and not isinstance(seed, jax.Array) and whole >= 2**63):
         raise fail("seed", repr(seed), "be an integer of 64 bits", "Pass a whole number, as in pc.fast_key(0).")
     return jax.random.wrap_key_data(_seed(whole), impl=SQUARES)
+
+
+def rearranged(keys: Key[Array, "*keys"], arrange: Callable[[np.ndarray], np.ndarray]) -> Key[Array, "..."]:
+    """The keys whose words are `arrange` of those of `keys`, (*keys, words): on the host, where nothing is compiled."""
+    words = arrange(np.asarray(jax.random.key_data(keys)))
+    return jax.random.wrap_key_data(jax.device_put(words), impl=jax.random.key_impl(keys))
 
 
 def is_fast(keys: Key[Array, "*keys"]) -> bool:

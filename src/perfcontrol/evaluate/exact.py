@@ -100,7 +100,8 @@ def check_digits(cost: Any, problem: PerformativeProblem, world: World) -> None:
     """
     if isinstance(world, StationaryWorld) or not known(cost, world):
         return
-    if np.max(world.Lambda) <= 100 * np.max(world.Lambda[-1]):  # definite: the largest entry is on the diagonal
+    cost, Lambda = np.asarray(cost), np.asarray(world.Lambda)  # JAX would compile a program for each step of this
+    if np.max(Lambda) <= 100 * np.max(Lambda[-1]):  # definite: the largest entry is on the diagonal
         return
     free, _ = weigh(problem, world, np.zeros(problem.policy_shape, cost.dtype))
     if cost < ROUNDINGS * np.finfo(cost.dtype).eps * free:

@@ -4,7 +4,6 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
@@ -14,7 +13,7 @@ from perfcontrol.problem import PerformativeProblem
 def in_single_precision(problem: PerformativeProblem) -> PerformativeProblem:
     """The problem with every floating-point array in float32."""
     return jax.tree.map(
-        lambda leaf: jnp.asarray(np.asarray(leaf, np.float32)) if eqx.is_inexact_array(leaf) else leaf, problem
+        lambda leaf: jax.device_put(np.asarray(leaf, np.float32)) if eqx.is_inexact_array(leaf) else leaf, problem
     )
 
 

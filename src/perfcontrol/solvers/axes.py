@@ -13,6 +13,7 @@ from jaxtyping import Array
 
 from perfcontrol._checks import as_array, check_instance, fail
 from perfcontrol.problem import PerformativeProblem, check_problem
+from perfcontrol.random_keys import rearranged
 from perfcontrol.solvers.base import AbstractSolver
 from perfcontrol.solvers.rows import Rows, Shared
 
@@ -32,7 +33,7 @@ def arranged(problems: Any, solvers: Any, M0: Any, keys: Any) -> tuple[tuple[int
     axes = lead if keys is None else lead + keys.shape[-1:]
     place = np.unravel_index(np.arange(math.prod(axes)), axes) if axes else [np.zeros(1, int)]
     zero = np.zeros_like(place[0])
-    key = None if keys is None else jnp.broadcast_to(keys, axes or (1,)).reshape(-1)
+    key = None if keys is None else rearranged(keys, lambda words: _a_row(words, axes or (1,), 1))
     start = None if M0 is None else _starts(problems, M0, axes)
     rows = Rows(place[0] if many else zero, place[int(many)] if several else zero, key, start)
     return axes, Shared(problems, stacked), rows
@@ -109,7 +110,7 @@ def _keys(keys: Any, axes: tuple[int, ...]) -> Array | None:
     return jnp.broadcast_to(keys, (*axes, keys.shape[-1]))
 
 
-def _starts(problems: PerformativeProblem, M0: Any, axes: tuple[int, ...]) -> Array:
+def _starts(problems: PerformativeProblem, M0: Any, axes: tuple[int, ...]) -> np.ndarray:
     """A start for each row."""
     M0, shape = as_array("M0", M0), problems.policy_shape
     lead = M0.shape[: max(M0.ndim - len(shape), 0)]
@@ -123,4 +124,10 @@ def _starts(problems: PerformativeProblem, M0: Any, axes: tuple[int, ...]) -> Ar
             f"be one policy, {shape}, or have shape {(*axes, *shape)}",
             "Pass an axis of length 1 where starts are shared.",
         )
-    return jnp.broadcast_to(M0, (*axes, *shape)).reshape(-1, *shape).astype(problems.dtype)
+    return _a_row(np.asarray(M0), axes, len(shape)).astype(problems.dtype)
+
+
+def _a_row(array: np.ndarray, axes: tuple[int, ...], own: int) -> np.ndarray:
+    """One member for each row, of an array that has `own` axes for a member behind those of the answer."""
+    shape = array.shape[-own:]
+    return np.broadcast_to(array, (*axes, *shape)).reshape(-1, *shape)

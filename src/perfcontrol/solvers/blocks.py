@@ -6,14 +6,13 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from perfcontrol._array_files import filled
 from perfcontrol.evaluate.paths import LANES, lanes
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.solvers.base import AbstractSolver
-from perfcontrol.solvers.result import Result
+from perfcontrol.solvers.result import Result, where
 from perfcontrol.solvers.rows import Rows, Shared, advance, advance_wide, begin, finish
 from perfcontrol.solvers.run_folder import RunFolder
 from perfcontrol.solvers.runs import Record
@@ -35,10 +34,11 @@ class Work(NamedTuple):
 
     def run(self, rows: Rows, show: Callable[[int], None]) -> dict[str, Any]:
         """What every row has ended with, on the host; `show` is called with the iterations done."""
+        rows = rows.dealt()
         state, kept = begin(self.lanes, self.record, self.shared, rows)
         history: list[Any] = []
         chunk, done = max(self.every, CHUNK - CHUNK % self.every), 0
-        while done < self.total and bool(jnp.any(state.result == Result.running)):
+        while done < self.total and np.any(where(state.result, Result.running)):
             count = min(chunk, self.total - done)
             rest = count % self.every
             if count > rest:

@@ -5,7 +5,6 @@ from contextlib import nullcontext
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.experimental import multihost_utils
 
@@ -15,7 +14,7 @@ from perfcontrol.problem import warn_of_unstable_gain
 from perfcontrol.solvers.axes import arranged
 from perfcontrol.solvers.base import Solution, SolveError
 from perfcontrol.solvers.blocks import Work, lanes_of, run_blocks
-from perfcontrol.solvers.result import Result
+from perfcontrol.solvers.result import Result, where
 from perfcontrol.solvers.rows import Rows, Shared, pick
 from perfcontrol.solvers.run_folder import RunFolder, held
 from perfcontrol.solvers.runs import Record
@@ -90,8 +89,8 @@ def solve_many(
             answer = _rescued(answer, shared, rows.take(place))
     if processes > 1:
         answer = _gathered(answer, len(rows.problem))
-    solution = Solution(**jax.tree.map(lambda leaf: jnp.asarray(leaf.reshape((*axes, *leaf.shape[1:]))), answer))
-    if throw and not bool(jnp.all(solution.result == Result.success)):
+    solution = Solution(**jax.device_put(jax.tree.map(lambda leaf: leaf.reshape((*axes, *leaf.shape[1:])), answer)))
+    if throw and not np.all(where(solution.result, Result.success)):
         raise SolveError(str(solution), solution)
     return solution
 
@@ -120,7 +119,7 @@ def _check_starts(shared: Shared, rows: Rows) -> None:
 
 def _rescued(answer: dict[str, Any], shared: Shared, rows: Rows) -> dict[str, Any]:
     """The answer with what `pc.solve` reaches by another method where this one failed and has one."""
-    for place in np.flatnonzero(np.asarray(answer["result"] != Result.success)):
+    for place in np.flatnonzero(~where(answer["result"], Result.success)):
         row = rows.take(place)
         problem = pick(shared.problems, row.problem)
         solver = pick(shared.solvers, row.solver).on(problem, row.key)

@@ -11,11 +11,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, PartitionSpec
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array
 
 from perfcontrol._programs import known, program
 from perfcontrol.problem import PerformativeProblem
+from perfcontrol.random_keys import rearranged
 from perfcontrol.solvers.base import AbstractSolver, State
 from perfcontrol.solvers.result import Result
 from perfcontrol.solvers.runs import Record, record_of, run_steps
@@ -29,7 +30,10 @@ class Shared(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """One run a row. start: None for the feasible policy nearest to zero; key: None where nothing is drawn."""
+    """One run a row, held on the host.
+
+    start: None for the feasible policy nearest to zero; key: None where nothing is drawn.
+    """
 
     problem: Any
     solver: Any
@@ -38,7 +42,12 @@ class Rows(NamedTuple):
 
     def take(self, index: Any) -> "Rows":
         """Some of the rows, or one."""
-        return jax.tree.map(lambda leaf: leaf[index], self)
+        arrays = jax.tree.map(lambda leaf: leaf[index], self._replace(key=None))
+        return arrays._replace(key=None if self.key is None else rearranged(self.key, lambda words: words[index]))
+
+    def dealt(self) -> "Rows":
+        """The rows on the devices that work on them."""
+        return jax.device_put(self, NamedSharding(*_over_devices()))
 
 
 def pick(stack: Any, index: Any) -> Any:
@@ -46,7 +55,7 @@ def pick(stack: Any, index: Any) -> Any:
 
     def picked(leaf: Any) -> Any:
         # What is known is picked on the host: JAX would compile a program for each shape.
-        return jnp.asarray(np.asarray(leaf)[index]) if known(leaf, index) else leaf[index]
+        return jax.device_put(np.asarray(leaf)[index]) if known(leaf, index) else leaf[index]
 
     return jax.tree.map(lambda leaf: picked(leaf) if eqx.is_array(leaf) else leaf, stack)
 
@@ -73,9 +82,14 @@ def groups_on_devices(function: Callable[..., Any], lanes: int, shared: Any, row
         ended = jax.lax.map(lambda group: function(eqx.combine(arrays, others), group), groups)
         return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), ended)
 
-    mesh, split = Mesh(np.array(jax.local_devices()), ("rows",)), PartitionSpec("rows")
+    mesh, split = _over_devices()
     specs = (PartitionSpec(), split)
     return jax.shard_map(local, mesh=mesh, in_specs=specs, out_specs=split, check_vma=False)(arrays, rows)
+
+
+def _over_devices() -> tuple[Mesh, PartitionSpec]:
+    """The devices of this process, and rows dealt out to them."""
+    return Mesh(np.array(jax.local_devices()), ("rows",)), PartitionSpec("rows")
 
 
 def _parts(shared: Shared, row: Rows) -> tuple[PerformativeProblem, AbstractSolver, Array]:

@@ -5,7 +5,6 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import xarray
 from jaxtyping import Array
@@ -19,7 +18,7 @@ from perfcontrol.experiments.stock import HORIZON, ORDERS
 from perfcontrol.problem import PerformativeProblem
 from perfcontrol.random_keys import fast_key
 from perfcontrol.solvers import RSGD, Solution, solve_many
-from perfcontrol.solvers.result import MEMBERS
+from perfcontrol.solvers.result import MEMBERS, where
 from perfcontrol.solvers.runs import identity
 
 DIMINISHING_OFFSET = 10.0  # η_n = step 10 / (n + 10)
@@ -47,7 +46,7 @@ class Laboratory(NamedTuple):
         solvers = [RSGD(1, rule, gradient=StockByStock()) for rule in (rules if several else [rules])]
         starts = self.starts[: stream.shape[-1]].reshape(*(1,) * (stream.ndim - 1), -1, *self.starts.shape[1:])
         return solve_many(
-            jax.tree.map(lambda leaf: jnp.asarray(leaf[cases]), self.problems),
+            jax.device_put(jax.tree.map(lambda leaf: leaf[cases], self.problems)),
             solvers if several else solvers[0],
             starts,
             keys=keys,
@@ -96,7 +95,7 @@ def names_of(solution: Solution) -> np.ndarray:
     """How each run ended, in a word."""
     names = np.empty(solution.steps.shape, dtype="<U9")
     for name, member in MEMBERS.items():
-        names[np.asarray(solution.result == member)] = name
+        names[where(solution.result, member)] = name
     return names
 
 
