@@ -40,7 +40,7 @@ def bootstrap(
     return float(statistic(samples)), (float(low), float(high))
 
 
-def median(rows: np.ndarray) -> np.ndarray:
+def median(rows: np.ndarray) -> Any:
     """Medians over the first axis: the middle of what sorting gives, which beats selecting where rows are few."""
     ordered = np.sort(rows, axis=0)
     return (ordered[(len(rows) - 1) // 2] + ordered[len(rows) // 2]) / 2
@@ -57,7 +57,8 @@ def wilson(successes: int, trials: int) -> tuple[float, tuple[float, float]]:
 
 def loglog_slope(steps: np.ndarray, values: np.ndarray) -> float:
     """Least-squares slope of log values against log steps."""
-    return float(np.polyfit(np.log(steps), np.log(values), 1)[0])
+    across = np.log(steps) - np.mean(np.log(steps))
+    return float(across @ np.log(values) / (across @ across))
 
 
 def as_markdown(claims: Sequence[Claim], settings: Mapping[str, Any]) -> str:

@@ -56,28 +56,32 @@ def _form(market: Any, total: Any, square: Any) -> Any:
     rho, first, variance, exposure, capital, mean, spread = market
 
     def of_rows(rows: tuple[Array, Array]) -> tuple[Array, Array, Array]:
-        total, square = rows
+        reaction, square = rows[0] / exposure, rows[1] / exposure**2
+        drift, zero = mean * (1 + rows[0]), jnp.zeros_like(square)
 
         def retreat(carry: Any, day: Any) -> tuple[Any, None]:
             of_r, of_q, linear, constant, by_own, by_square = carry
-            first_t, variance_t, seen = day
-            phi, both, drift = rho - 1 + first_t * total / exposure, of_r + of_q, mean * (1 + seen * total)
+            first_t, variance_t = day
+            phi, both, pushed = rho - 1 + first_t * reaction, of_r + of_q, of_q * drift
             following = (
                 1 + phi**2 * of_r,
-                phi**2 * of_q + variance_t * square / exposure**2 * both,
-                phi * (of_q * drift + linear),
-                constant + spread * both + of_q * drift**2 + 2 * linear * drift,
-                by_own + 2 * spread * seen * phi * both,
-                by_square + spread * seen * both,
+                phi**2 * of_q + variance_t * square * both,
+                phi * (pushed + linear),
+                constant + drift * (pushed + 2 * linear),
+                by_own + phi * both,
+                by_square + both,
             )
             return following, None
 
-        zero = jnp.zeros_like(square)
-        horizon = len(first)
-        days = (first, variance, (jnp.arange(horizon) > 0).astype(square.dtype))
-        start = (zero + 1, zero, zero, zero, zero, zero + horizon * spread)
-        (_, of_q, linear, constant, by_own, by_square), _ = jax.lax.scan(retreat, start, days, reverse=True)
-        return constant + of_q * capital**2 + 2 * linear * capital, by_own, by_square
+        (of_r, of_q, linear, constant, by_own, by_square), _ = jax.lax.scan(
+            retreat, (zero + 1, *[zero] * 5), (first[1:], variance[1:]), reverse=True
+        )
+        # The first day, on which nothing has been seen that could be answered.
+        phi, both = rho - 1 + first[0] * reaction, of_r + of_q
+        constant += mean * (of_q * mean + 2 * linear) + spread * (by_square + both)
+        of_q, linear = phi**2 * of_q + variance[0] * square * both, phi * (of_q * mean + linear)
+        constant += of_q * capital**2 + 2 * linear * capital
+        return constant, 2 * spread * by_own, spread * (len(first) + by_square)
 
     return jax.lax.map(of_rows, (total, square))
 

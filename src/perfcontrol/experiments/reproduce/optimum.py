@@ -21,7 +21,8 @@ from perfcontrol.experiments.reproduce.cases import Progress, by_case
 from perfcontrol.problem import PerformativeProblem
 
 GAP = 1e-3  # relative, between the best policy and the proof
-GRID = 24  # points that the search for the best policy starts from
+GRID = 24  # points of each round of the search for the best policy, which goes on between the neighbours of the best
+WIDTH = 1e-9  # of what is left in the end, relative to the first round
 MOST = 5000  # intervals
 
 
@@ -51,7 +52,6 @@ def _value(form: tuple[Any, Any, Any], d: Any) -> Any:
 
 def optimal_policy(problem: PerformativeProblem, gap: float = GAP) -> tuple[float, float, float, int]:
     """The optimal d, its cost, a proved lower bound of what any feasible policy costs, and the intervals used."""
-    from scipy.optimize import minimize_scalar
 
     def cost(d: Any) -> Any:
         return _value(parabola(problem, d), d)
@@ -62,13 +62,14 @@ def optimal_policy(problem: PerformativeProblem, gap: float = GAP) -> tuple[floa
     if problem.feasible_set.nonnegative:
         stocks, total = _stocks_and_total(problem)
         low, high = max(low, -total / stocks), min(high, total * (stocks - 1) / stocks)
-    grid = np.linspace(low, high, GRID)
-    around = int(np.argmin(cost(grid)))
-    ends = grid[max(around - 1, 0)], grid[min(around + 1, GRID - 1)]
-    found: Any = minimize_scalar(cost, bounds=ends, method="bounded", options={"xatol": 1e-10})
-    tried = np.array([0.0, *ends, found.x])
-    best = float(tried[np.argmin(cost(tried))])
-    least = float(cost(best))
+    ends = low, high
+    while ends[1] - ends[0] > WIDTH * (high - low):
+        grid = np.linspace(*ends, GRID)
+        around = int(np.argmin(cost(grid)))
+        ends = grid[max(around - 1, 0)], grid[min(around + 1, GRID - 1)]
+    tried = np.array([0.0, *ends])
+    costs = cost(tried)
+    best, least = float(tried[np.argmin(costs)]), float(np.min(costs))
     lower, cells = lower_bound(problem, (low, high), least * (1 - gap))
     return best, least, min(lower, least), cells
 

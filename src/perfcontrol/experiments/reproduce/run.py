@@ -14,7 +14,6 @@ from typing import NamedTuple
 import jax
 import xarray
 
-from perfcontrol import results
 from perfcontrol.config import ReproduceSettings
 from perfcontrol.experiments.reproduce.cases import Progress, problems_of, silent
 from perfcontrol.experiments.reproduce.divergence import cure_stage, floors_stage, sweep_stage
@@ -24,6 +23,7 @@ from perfcontrol.experiments.reproduce.optimum import optimum_stage
 from perfcontrol.experiments.reproduce.stages import Stages
 from perfcontrol.reports.claims import Claim, as_markdown
 from perfcontrol.reports.paper import judge
+from perfcontrol.results import check_writable, save_json, save_text
 
 STAGES = ("exact", "exact_simplex", "optimum", "floors", "runs", "cure", "sweep")
 
@@ -50,7 +50,7 @@ def reproduce(out: Path, settings: ReproduceSettings, progress: Progress | None 
     """
     if not jax.config.jax_enable_x64:  # type: ignore[attr-defined]
         raise RuntimeError('The reproduction needs float64: call jax.config.update("jax_enable_x64", True) first.')
-    results.check_writable(out)
+    check_writable(out)
     progress = progress or silent
     stages = Stages(out, settings, fresh)
     problems, bounded_problems = problems_of(settings, settings.feasible_set), problems_of(settings, "simplex")
@@ -79,8 +79,8 @@ def reproduce(out: Path, settings: ReproduceSettings, progress: Progress | None 
         claims = stages.timed(
             "claims", lambda: judge(exact.result(), exact_bounded, optimum, runs, cure, sweep, settings)
         )
-        results.save_json([claim.as_dict() for claim in claims], out / "claims.json")
-        results.save_text(as_markdown(claims, settings.model_dump()), out / "claims.md")
+        save_json([claim.as_dict() for claim in claims], out / "claims.json")
+        save_text(as_markdown(claims, settings.model_dump()), out / "claims.md")
         files += cured.result()
     data = [out / f"{stage}.nc" for stage in STAGES if stage in stages.seconds]
     return Outcome([*data, out / "claims.json", out / "claims.md", *files], claims, stages.seconds)

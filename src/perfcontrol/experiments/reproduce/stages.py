@@ -9,8 +9,8 @@ from typing import TypeVar
 
 import xarray
 
-from perfcontrol import results
 from perfcontrol.config import ReproduceSettings
+from perfcontrol.results import load_dataset, save_dataset, versions
 
 Value = TypeVar("Value")
 
@@ -20,7 +20,7 @@ class Stages:
 
     def __init__(self, folder: Path, settings: ReproduceSettings, fresh: bool):
         self.folder, self.settings, self.fresh = folder, settings, fresh
-        text = json.dumps([settings.model_dump(), results.versions()], sort_keys=True)
+        text = json.dumps([settings.model_dump(), versions()], sort_keys=True)
         self.fingerprint = hashlib.sha256(text.encode()).hexdigest()[:16]
         self.seconds: dict[str, float] = {}
 
@@ -28,7 +28,7 @@ class Stages:
         path = self.folder / f"{name}.nc"
         if not self.fresh and path.exists():
             try:
-                dataset = results.load_dataset(path)
+                dataset = load_dataset(path)
             except (OSError, ValueError, KeyError):  # not ours, or cut short by an older version: run again
                 dataset = None
             if dataset is not None and dataset.attrs.get("fingerprint") == self.fingerprint:
@@ -38,7 +38,7 @@ class Stages:
         def computed() -> xarray.Dataset:
             dataset = compute()
             attributes = {"settings": self.settings.model_dump(), "fingerprint": self.fingerprint}
-            results.save_dataset(dataset, path, attributes)
+            save_dataset(dataset, path, attributes)
             return dataset
 
         return self.timed(name, computed)

@@ -3,7 +3,7 @@
 import numpy as np
 import xarray
 
-from perfcontrol.reports.claims import Claim, bootstrap
+from perfcontrol.reports.claims import Claim, bootstrap, median
 from perfcontrol.reports.paper.statistics import listed, orders, worst
 
 
@@ -43,7 +43,7 @@ def smaller_step(cure: xarray.Dataset) -> Claim:
     values, floors, over = {}, {}, {}
     for order in orders(cure):
         rows = cure["smaller"].sel(order=order).values
-        values[order] = bootstrap(rows[:, -1] / rows[:, 0], np.median)
+        values[order] = bootstrap(rows[:, -1] / rows[:, 0], median)
         floors[order] = float(cure["floor_smaller"].sel(order=order))
         over[order] = float(np.mean(rows[:, -(rows.shape[1] // 4) :])) / floors[order]
     name, value, interval = worst(values)

@@ -12,7 +12,7 @@ FAR_ORDERS = ("descending", "random")
 
 def error_decays(runs: xarray.Dataset, regime: str) -> Claim:
     """The error decays for every order of a regime."""
-    values = {order: bootstrap(relative_error(runs, regime, order), np.median) for order in orders(runs)}
+    values = {order: bootstrap(relative_error(runs, regime, order), median) for order in orders(runs)}
     name, value, interval = worst(values)
     share = {order: float(np.mean(relative_error(runs, regime, order) < 1)) for order in values}
     panel = {"stable": "left", "general": "right"}[regime]
@@ -160,7 +160,7 @@ def cost_is_larger(runs: xarray.Dataset) -> Claim:
 
 def ascending_survives(runs: xarray.Dataset) -> Claim:
     """The third comes closer."""
-    value, interval = bootstrap(relative_error(runs, "unstable", "ascending"), np.median)
+    value, interval = bootstrap(relative_error(runs, "unstable", "ascending"), median)
     return Claim(
         "In the unstable regime the ascending order alone converges",
         f"{SECTION}, Figure 1 middle (implied)",

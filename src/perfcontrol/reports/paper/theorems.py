@@ -61,7 +61,7 @@ def theorem(cure: xarray.Dataset, settings: ReproduceSettings) -> Claim:
 def backward_decay(cure: xarray.Dataset) -> Claim:
     """What Proposition 2 is read to require."""
     rows = cure["diminishing"].sel(order="descending").values
-    value, interval = bootstrap(rows[:, -1] / rows[:, 0], np.median)
+    value, interval = bootstrap(rows[:, -1] / rows[:, 0], median)
     return Claim(
         "In the unstable regime sensitivities must decay backward in time for M^PS to be reached",
         "Proposition 2, as Section Numerical Experiments reads it",

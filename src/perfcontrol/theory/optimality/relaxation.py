@@ -7,7 +7,6 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import optimize
 
 from perfcontrol._programs import program
 from perfcontrol.problem import PerformativeProblem
@@ -83,7 +82,9 @@ class OnAffine:
         center = self.vectors.T @ self.gradient / roots  # x = roots * (vectorsᵀ y) + center has ‖x‖² / 2 = q + constant
         rows = -along / roots
         right = rows @ center - offsets
-        weights, _ = optimize.nnls(np.concatenate([rows.T, right[None]]), np.append(np.zeros(len(center)), 1.0))
+        from scipy.optimize import nnls  # inside: its import takes 0.2 s
+
+        weights, _ = nnls(np.concatenate([rows.T, right[None]]), np.append(np.zeros(len(center)), 1.0))
         slack = 1 - float(right @ weights)
         # The multipliers; where no policy satisfies all (no slack is left), a ray along which the bound grows.
         for mu in [weights / slack] if slack > 1e-9 else [weights * 10.0**power for power in range(13)]:
@@ -157,6 +158,8 @@ class OnSet:
     def on_halfspaces(self, normals: np.ndarray, offsets: np.ndarray, enough: float) -> Least:
         """A lower bound where normals (M - base) ≤ offsets, normals (c, p): the best dual value that an ascent in the
         multipliers meets, or the first above `enough`."""
+        from scipy.optimize import minimize  # inside: its import takes 0.2 s
+
         best = self.least()
         excess = normals @ (best.M - self.base) - offsets
         if best.value >= enough or np.all(excess <= 0):
@@ -182,7 +185,7 @@ class OnSet:
         try:
             bounds = [(0.0, None)] * len(offsets)
             options = {"maxiter": ROUNDS, "ftol": 1e-13, "gtol": 1e-12}
-            optimize.minimize(dual, np.zeros(len(offsets)), jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+            minimize(dual, np.zeros(len(offsets)), jac=True, method="L-BFGS-B", bounds=bounds, options=options)
         except _Enough:
             pass
         return best
