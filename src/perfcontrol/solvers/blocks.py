@@ -38,7 +38,9 @@ class Work(NamedTuple):
         state, kept = begin(self.lanes, self.record, self.shared, rows)
         history: list[Any] = []
         chunk, done = max(self.every, CHUNK - CHUNK % self.every), 0
-        while done < self.total and np.any(where(state.result, Result.running)):
+        unfinished = True
+        while done < self.total and unfinished:
+            before = state.result
             count = min(chunk, self.total - done)
             rest = count % self.every
             if count > rest:
@@ -47,6 +49,9 @@ class Work(NamedTuple):
                 kept = following
             if rest:
                 state, _ = self._advanced(rows, state, done + count - rest, rest, None, 1)
+            # Asked of the chunk before this one, so that the devices need not wait for the answer: should all have ended
+            # by then, this one changes nothing.
+            unfinished = np.any(where(before, Result.running))
             done += count
             if done < self.total:
                 show(done)
