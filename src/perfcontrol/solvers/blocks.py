@@ -49,9 +49,9 @@ class Work(NamedTuple):
                 kept = following
             if rest:
                 state, _ = self._advanced(rows, state, done + count - rest, rest, None, 1)
-            # Asked of the chunk before this one, so that the devices need not wait for the answer: should all have ended
+            # Asked of the chunk before this one, so that the devices need not wait for the answer: where all had ended
             # by then, this one changes nothing.
-            unfinished = np.any(where(before, Result.running))
+            unfinished = bool(np.any(where(before, Result.running)))
             done += count
             if done < self.total:
                 show(done)
