@@ -33,7 +33,7 @@ from coverage import CoverageData
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "src" / "perfcontrol"
 TESTS = {  # the tests of a room
-    "evaluate": ["tests/evaluate", "tests/response", "tests/test_properties.py"],
+    "evaluate": ["tests/evaluate", "tests/response", "tests/test_kernel.py", "tests/test_properties.py"],
     "response": ["tests/response", "tests/solvers"],
     "solvers": ["tests/solvers"],
     "sets": ["tests/sets", "tests/response"],
