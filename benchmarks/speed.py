@@ -29,10 +29,9 @@ def table(quick: bool) -> str:
         if not quick or name == SMALL:
             some, printed[name] = gradient_rows(f"dense, signs {name}", problem_of(*shape))
             rows += some
-    for name, shape in SHAPES.items():
-        if name in printed and name != "(4, 10, 200)":
-            for law, kind in LAWS.items():
-                rows += sampled_rows(f"dense, {kind} {name}", problem_of(*shape, law=law), printed[name])
+    laws = [(law, kind, name) for name in (SMALL, LARGE) if name in printed for law, kind in LAWS.items()]
+    for law, kind, name in laws:
+        rows += sampled_rows(f"dense, {kind} {name}", problem_of(*SHAPES[name], law=law), printed[name])
     uniform = in_single_precision(problem_of(20, 1, 60, law="uniform"))
     M = policy_of(uniform)
     rows += seed_rows(
@@ -40,10 +39,8 @@ def table(quick: bool) -> str:
     )
     rows += lane_rows(f"dense, uniform entries {SMALL}", "float32", uniform, M, printed[SMALL])
     pc.use_kernel()
-    for name, shape in SHAPES.items():
-        if name in printed and name != "(4, 10, 200)":
-            for law, kind in LAWS.items():
-                rows += kernel_rows(f"dense, {kind} {name}", problem_of(*shape, law=law), printed[name])
+    for law, kind, name in laws:
+        rows += kernel_rows(f"dense, {kind} {name}", problem_of(*SHAPES[name], law=law), printed[name])
     pc.use_kernel(False)
     rows += at_once.rows(f"dense, uniform entries {SMALL}")
     directional, stock = problem_of(20, 1, 60, "directional"), pc.experiments.stock_market("random")
