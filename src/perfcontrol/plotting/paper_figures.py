@@ -159,8 +159,8 @@ def figure_cure(cure: xarray.Dataset, sweep: xarray.Dataset, settings: Reproduce
     right.axvline(1, color="#555555", linestyle=(0, (4, 3)), linewidth=1)
     right.annotate(
         "mean-square\nthreshold",
-        (1, 50),
-        xytext=(-5, 0),
+        (1, 64),
+        xytext=(-10, 0),
         textcoords="offset points",
         ha="right",
         va="center",
