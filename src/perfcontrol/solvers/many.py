@@ -127,7 +127,11 @@ def _rescued(answer: dict[str, Any], shared: Shared, rows: Rows) -> dict[str, An
             break
         ended = solve(problem, solver, row.start, key=row.key, throw=False)
         found = {"M": ended.M, "result": ended.result, "steps": ended.steps, "stats": ended.stats}
-        for leaf, value in zip(*map(jax.tree.leaves, ({k: answer[k] for k in found}, found)), strict=True):
+        ours = {name: answer[name] for name in found}
+        # What comes from a device cannot be written to.
+        ours = jax.tree.map(lambda leaf: leaf if leaf.flags.writeable else leaf.copy(), ours)
+        answer |= ours
+        for leaf, value in zip(*map(jax.tree.leaves, (ours, found)), strict=True):
             leaf[place] = value
     return answer
 
