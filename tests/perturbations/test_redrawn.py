@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import textwrap
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -91,13 +92,13 @@ def test_only_what_is_large_is_drawn_again():
 
 
 @pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="this system does not say how much a process held")
 @pytest.mark.parametrize(
     "call", ["pc.sample_gradient(problem, M, key=key, samples=9)", "pc.solve(problem, pc.RSGD(2, 1e-9), M, key=key)"]
 )
 def test_hundred_thousand_steps_of_twenty_states_fit_into_six_hundred_mebibytes(call):
     """The matrices of one path alone are 320 MB, and there are nine paths."""
     program = f"""
-        import resource
         import numpy as np
         import perfcontrol as pc
 
@@ -110,7 +111,7 @@ def test_hundred_thousand_steps_of_twenty_states_fit_into_six_hundred_mebibytes(
         )
         M, key = 0.01 * np.ones((1, 20, 20)), pc.fast_key(0)
         assert np.all(np.isfinite(getattr(answer := {call}, "M", answer)))
-        print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
-    """
+        print(next(line for line in open("/proc/self/status") if line.startswith("VmHWM")).split()[1])
+    """  # not by getrusage, which counts what the process that starts this one has held
     done = subprocess.run([sys.executable, "-c", textwrap.dedent(program)], capture_output=True, text=True, check=True)
     assert int(done.stdout) * 1024 < 600 * 2**20
