@@ -38,6 +38,9 @@ class TestPerformativeOptimum(SolverContract):
             assert bool(solution.stats["unique"])
             assert float(pc.residual(problem, solution.M)) > 1e-4, "an optimum need not be stable"
 
+    def test_first_step_counts_as_one(self):
+        assert int(pc.solve(self.problems[0], SOLVER, max_steps=1, throw=False).steps) == 1
+
 
 # --- closed forms ----------------------------------------------------------------------------------------------------
 
