@@ -72,7 +72,7 @@ def sustained_form(world: World, memory: int) -> Array:
     """(H m, H m): the quadratic form that constant feedforwards ṽ_i, held from time i on, meet (i = 1..H)."""
     if isinstance(world, StationaryWorld):  # in the long run the lags do not differ
         return jnp.tile(world.sustained(), (memory, memory))
-    T, m = len(world.Lambda), world.B.shape[-1]
+    T, m, D = len(world.Lambda), world.B.shape[-1], world.D
     varying = world.F.ndim == 3
 
     def back(Y: Array, step: Any) -> tuple[Array, Array]:
@@ -81,8 +81,8 @@ def sustained_form(world: World, memory: int) -> Array:
         return Y, Y
 
     # Y_t = D_t + Y_{t+1} F_t: what a state at time t couples to from then on.
-    _, Y = jax.lax.scan(back, world.D[T], (world.F if varying else None, world.D[:T]), reverse=True)
-    Y = jnp.concatenate([Y, world.D[T:]])
+    _, Y = jax.lax.scan(back, D[T], (world.F if varying else None, D[:T]), reverse=True)
+    Y = jnp.concatenate([Y, D[T:]])
     B = as_dense(world.B)
     later = tail_sums(Y[1:] @ B, memory, T) if B.ndim == 3 else tail_sums(Y[1:], memory, T) @ B  # pushes from a on
     latest = jnp.maximum(*jnp.indices((memory, memory)))
