@@ -48,9 +48,13 @@ def goals_table(rows: list[Row], small: str, large: str) -> str:
     ):
         goal = f"a seed of many, {law}, float32, all cores, of (a)"
         add(goal, least, both(lambda by, law=law: per_seed(law, small, by)))
-    as_small = per_seed("uniform entries", small, "")
-    values = both(lambda by: per_seed("uniform entries", large, by))
-    add(f"the same with uniform entries at {large}, as at {small}", as_small, values)
+
+    def kept(by: str) -> float | None:
+        """What is kept, at the large shape, of the factor at the small one."""
+        at_large, at_small = (per_seed("uniform entries", shape, by) for shape in (large, small))
+        return at_large / at_small if at_large and at_small else None
+
+    add(f"the same with uniform entries at {large}, of what it is at {small}", 1, both(kept))
     for family in FAMILIES:
         exact = [s for (case, what), s in took.items() if case == f"{family} {small}" and what.startswith("exact cost")]
         add(f"exact cost and gradient, {family}, of reverse mode", 10, [exact[0] / exact[1], None])
